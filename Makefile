@@ -1,0 +1,58 @@
+# `make help` lists the targets. `export:` has no space before its colon: `export :` is a directive.
+PYTHON ?= $(shell python3.11 -c '' 2>/dev/null && echo python3.11 || echo python3)
+VENV := .venv
+BIN := $(VENV)/bin
+PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt
+option = $(if $(filter-out 0,$($(1))),$(2))
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test check format train export bench clean
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+install: $(VENV)/.all ## put everything, torch included, into .venv
+
+demo: $(VENV)/.demo ## teach once and repeat in simulation (SEED=n SCENE=dir OBSTACLE=1 FAST=1)
+	$(BIN)/python -m cbe_bench.demo \
+	  $(if $(SEED),--seed $(SEED)) $(if $(SCENE),--scene "$(SCENE)") \
+	  $(call option,OBSTACLE,--obstacle) $(call option,FAST,--fast)
+
+test: $(VENV)/.all ## run the tests (ARGS="-k name" narrows)
+	$(BIN)/python -m pytest -n 2 --dist loadgroup $(ARGS)
+
+check: $(VENV)/.all ## lint, format check, types and the rooms' import rules
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(VENV)/.all ## apply ruff's format and safe fixes
+	$(BIN)/ruff format
+	$(BIN)/ruff check --fix
+
+train: $(VENV)/.all ## train, resuming where the last run ended (ARGS="--help" lists options)
+	$(BIN)/cbe-train $(ARGS)
+
+export: $(VENV)/.all ## turn the checkpoint into the shipped ONNX files, past the parity gate
+	$(BIN)/cbe-export $(ARGS)
+
+bench: $(VENV)/.all ## measure the speed of renderer, scanner and networks
+	$(BIN)/cbe-bench speed $(ARGS)
+
+clean: ## remove .venv and what tools cached
+	rm -rf $(VENV) dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
+
+# Stamps: an install runs again only when what it reads has changed.
+$(VENV)/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' || \
+	  { echo "Python 3.11 to 3.13 is needed, $$($(PYTHON) -V 2>&1) was found; name one: make PYTHON=python3.11"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.demo: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(PIP_INSTALL) -e '.[sim]'
+	@touch $@
+
+$(VENV)/.all: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(PIP_INSTALL) -e '.[train,bench,view,dev]'
+	@touch $(VENV)/.demo $@

@@ -1,0 +1,101 @@
+"""Names, shapes and types of the three ONNX graphs and of their metadata.
+
+The one place that names them: the exporter writes to it and the runtime refuses what differs.
+Batch 1, one tick, every recurrent state explicit (paper, Sec. III-B to III-D).
+"""
+
+from dataclasses import dataclass
+
+CONTRACT_VERSION = 1
+
+IMAGE_SIZE = 64
+FEATURES = (32, 16, 16)
+ATTRACTOR_SIZE = 400
+EMBEDDING_SIZE = 32
+
+
+@dataclass(frozen=True, slots=True)
+class Tensor:
+    """One input or output: its name, shape and onnxruntime element type."""
+
+    name: str
+    shape: tuple[int, ...]
+    dtype: str = "tensor(float)"
+
+
+@dataclass(frozen=True, slots=True)
+class Graph:
+    """One ONNX file: `<name>.onnx` with these tensors, in this order."""
+
+    name: str
+    inputs: tuple[Tensor, ...]
+    outputs: tuple[Tensor, ...]
+
+
+def encoder(state_size: int) -> Graph:
+    """Behavior encoder: image (1, 64, 64, 3) uint8 RGB; `is_first` is 1 on a behavior's first frame.
+
+    `embedding` is z of the frames seen since then (32 numbers).
+    """
+    state = (1, state_size)
+    return Graph(
+        "encoder",
+        (
+            Tensor("image", (1, IMAGE_SIZE, IMAGE_SIZE, 3), "tensor(uint8)"),
+            Tensor("previous_features", (1, *FEATURES)),
+            Tensor("is_first", (1,)),
+            Tensor("h", state),
+            Tensor("c", state),
+        ),
+        (
+            Tensor("features", (1, *FEATURES)),
+            Tensor("embedding", (1, EMBEDDING_SIZE)),
+            Tensor("h_next", state),
+            Tensor("c_next", state),
+        ),
+    )
+
+
+def attractor() -> Graph:
+    """Attractor: from the encoder's features to 400 numbers in [0, 1]."""
+    return Graph(
+        "attractor",
+        (Tensor("features", (1, *FEATURES)),),
+        (Tensor("attractor", (1, ATTRACTOR_SIZE)),),
+    )
+
+
+def generator(state_size: int) -> Graph:
+    """Waypoint generator: `waypoint_m` is x, y in base_link; progress runs 0 to 1.
+
+    `on_route` is the probability of being within 1 m of the demonstration.
+    """
+    state = (1, state_size)
+    attractors = ("attractor_now", "attractor_first", "attractor_start", "attractor_goal")
+    return Graph(
+        "generator",
+        (
+            *(Tensor(name, (1, ATTRACTOR_SIZE)) for name in attractors),
+            Tensor("embedding_now", (1, EMBEDDING_SIZE)),
+            Tensor("embedding_goal", (1, EMBEDDING_SIZE)),
+            Tensor("h", state),
+            Tensor("c", state),
+        ),
+        (
+            Tensor("waypoint_m", (1, 2)),
+            Tensor("progress", (1,)),
+            Tensor("on_route", (1,)),
+            Tensor("h_next", state),
+            Tensor("c_next", state),
+        ),
+    )
+
+
+METADATA_KEYS = (
+    "cbe.contract_version",  # str(CONTRACT_VERSION)
+    "cbe.model_id",  # 16 hex digits: hash of weights + preprocessing + quantisation
+    "cbe.network_period",  # steps between two network ticks, "1" or "2"
+    "cbe.camera",  # JSON of cbe.camera.CameraModel
+    "cbe.segment_steps",  # K: longest behavior in steps
+    "cbe.precision",  # "fp32" or "int8"
+)

@@ -1,0 +1,103 @@
+"""One tick of the trained networks as modules with the tensors of `cbe.signature`."""
+
+import torch
+from torch import Tensor, nn
+
+from cbe import signature
+from cbe_training.networks import BehaviorNetworks
+
+
+class LstmCell(nn.Module):
+    """One step of an LSTM as a single matrix product, which onnxruntime can also quantise."""
+
+    def __init__(self, lstm: nn.LSTM) -> None:
+        super().__init__()
+        weights = torch.cat([lstm.weight_ih_l0, lstm.weight_hh_l0], dim=1).detach()
+        self.gates = nn.Linear(weights.shape[1], weights.shape[0])
+        self.gates.weight = nn.Parameter(weights)
+        self.gates.bias = nn.Parameter((lstm.bias_ih_l0 + lstm.bias_hh_l0).detach())
+
+    def forward(self, x: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+        """Input (1, I) and state (1, S) twice, to the next state."""
+        keep_in, forget, new, out = self.gates(torch.cat([x, h], dim=1)).chunk(4, dim=1)
+        c = torch.sigmoid(forget) * c + torch.sigmoid(keep_in) * torch.tanh(new)
+        return torch.sigmoid(out) * torch.tanh(c), c
+
+
+class EncoderTick(nn.Module):
+    """Graph `encoder`."""
+
+    def __init__(self, networks: BehaviorNetworks) -> None:
+        super().__init__()
+        self.trunk = networks.trunk
+        self.pair = networks.encoder.pair
+        self.lstm = LstmCell(networks.encoder.lstm)
+        self.to_embedding = networks.encoder.to_embedding
+
+    def forward(
+        self, image: Tensor, previous_features: Tensor, is_first: Tensor, h: Tensor, c: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """See `cbe.signature.encoder`."""
+        features = self.trunk(image)
+        first = is_first.view(1, 1, 1, 1)
+        previous = first * features + (1.0 - first) * previous_features
+        # A new behavior starts from nothing, whatever state was passed in.
+        h, c = (1.0 - is_first) * h, (1.0 - is_first) * c
+        h, c = self.lstm(self.pair(features, previous), h, c)
+        return features, self.to_embedding(h), h, c
+
+
+class AttractorTick(nn.Module):
+    """Graph `attractor`."""
+
+    def __init__(self, networks: BehaviorNetworks) -> None:
+        super().__init__()
+        self.attractor = networks.attractor
+
+    def forward(self, features: Tensor) -> Tensor:
+        """See `cbe.signature.attractor`."""
+        return self.attractor(features)  # type: ignore[no-any-return]
+
+
+class GeneratorTick(nn.Module):
+    """Graph `generator`; both relations pass through the convolutions as one batch of two."""
+
+    def __init__(self, networks: BehaviorNetworks) -> None:
+        super().__init__()
+        generator = networks.generator
+        self.relation = generator.relation
+        self.behavior = generator.behavior
+        self.lstm = LstmCell(generator.lstm)
+        self.head = generator.head
+        self.out = generator.out
+
+    def forward(
+        self,
+        attractor_now: Tensor,
+        attractor_first: Tensor,
+        attractor_start: Tensor,
+        attractor_goal: Tensor,
+        embedding_now: Tensor,
+        embedding_goal: Tensor,
+        h: Tensor,
+        c: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """See `cbe.signature.generator`."""
+        now = torch.cat([attractor_now, attractor_first])
+        target = torch.cat([attractor_goal, attractor_start])
+        relations = self.relation(now, target).reshape(1, -1)  # (1, 2 * relation), goal first
+        behavior = self.behavior(torch.cat([embedding_now, embedding_goal], dim=1))
+        inputs = torch.cat([relations, behavior], dim=1)
+        h, c = self.lstm(inputs, h, c)
+        out = self.out(self.head(torch.cat([h, inputs], dim=1)))  # (1, 4)
+        return out[:, :2], out[:, 2], torch.sigmoid(out[:, 3]), h, c
+
+
+def ticks(networks: BehaviorNetworks) -> list[tuple[signature.Graph, nn.Module]]:
+    """The three graphs with the modules that compute them."""
+    config = networks.config
+    return [
+        (signature.encoder(config.encoder_state), EncoderTick(networks)),
+        (signature.attractor(), AttractorTick(networks)),
+        (signature.generator(config.generator_state), GeneratorTick(networks)),
+    ]

@@ -1,0 +1,128 @@
+"""The parity gate: torch against onnxruntime over real rollouts, recurrent state carried."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cbe import signature
+from cbe_hil_sim.generate import VALIDATION_SEEDS
+from cbe_training.config import TrainConfig
+from cbe_training.drives import Drives
+from cbe_training.networks import BehaviorNetworks
+from cbe_training.rollout import roll_out, show
+
+BEHAVIORS, FRAMES = 4, 40
+
+Arrays = dict[str, NDArray[np.generic]]
+
+
+@dataclass(frozen=True, slots=True)
+class Rides:
+    """B repetitions of behaviors: images (B, T, 64, 64, 3), real frames (B,), memory images."""
+
+    images: NDArray[np.uint8]
+    frames: NDArray[np.int64]
+    shown: NDArray[np.uint8]  # (B, T, 64, 64, 3)
+
+    @classmethod
+    def record(cls, networks: BehaviorNetworks, cache: Path) -> "Rides":
+        """Let the networks repeat behaviors in validation worlds."""
+        rng = np.random.default_rng(0)
+        drives = Drives.build(VALIDATION_SEEDS[:2], 4, cache)
+        behaviors = show(drives, BEHAVIORS, FRAMES, 2, rng)
+        done = roll_out(
+            networks, drives, behaviors, TrainConfig(), rng, expert_share=0.0, training=False
+        )
+        return cls(done.images, done.frames, behaviors.images[done.shown])
+
+
+def worst_difference(networks: BehaviorNetworks, folder: Path, rides: Rides) -> tuple[float, int]:
+    """Largest difference of any generator or encoder output, and over how many ticks."""
+    sessions = {
+        name: onnxruntime.InferenceSession(
+            str(folder / f"{name}.onnx"), providers=["CPUExecutionProvider"]
+        )
+        for name in ("encoder", "attractor", "generator")
+    }
+    worst, ticks = 0.0, 0
+    for images, frames, shown in zip(rides.images, rides.frames, rides.shown, strict=True):
+        expected = _run_torch(networks, images[:frames], shown)
+        found = _run_onnx(networks, sessions, images[:frames], shown)
+        worst = max(worst, float(np.abs(expected - found).max()))
+        ticks += int(frames)
+    return worst, ticks
+
+
+@torch.no_grad()
+def _run_torch(
+    networks: BehaviorNetworks, images: NDArray[np.uint8], shown: NDArray[np.uint8]
+) -> NDArray[np.float32]:
+    """Waypoint, progress, on_route and embedding (T, 36), the sequence at once."""
+
+    def look(frames: NDArray[np.uint8]) -> tuple[Tensor, Tensor]:
+        features = networks.trunk(torch.from_numpy(frames))
+        embedding, _ = networks.encoder(networks.encoder.pair.sequence(features, 1)[None])
+        return embedding, networks.attractor(features)
+
+    goal_z, goal = look(shown)
+    z, attractor = look(images)
+    relation, steps = networks.generator.relation, len(images)
+    to_goal = relation(attractor, goal[-1:].expand(steps, -1))[None]
+    to_start = relation(attractor[:1], goal[:1])[None].expand(1, steps, -1)
+    out = networks.generator(to_goal, to_start, z, goal_z[:, -1:].expand(1, steps, -1))
+    parts = [out.waypoint_m, out.progress[..., None], torch.sigmoid(out.on_route_logit)[..., None]]
+    return torch.cat([*parts, z], dim=-1)[0].numpy()
+
+
+def _run_onnx(
+    networks: BehaviorNetworks,
+    sessions: dict[str, onnxruntime.InferenceSession],
+    images: NDArray[np.uint8],
+    shown: NDArray[np.uint8],
+) -> NDArray[np.float32]:
+    """The same (T, 36), tick by tick."""
+    size = networks.config
+
+    def look(frames: NDArray[np.uint8]) -> tuple[Arrays, list[Arrays]]:
+        state = _zeros(signature.encoder(size.encoder_state))
+        seen: list[Arrays] = []
+        for index, image in enumerate(frames):
+            state["image"] = image[None]
+            state["is_first"] = np.array([float(index == 0)], np.float32)
+            out = _call(sessions["encoder"], state)
+            state |= {"previous_features": out["features"], "h": out["h_next"], "c": out["c_next"]}
+            attractor = _call(sessions["attractor"], {"features": out["features"]})
+            seen.append({"embedding": out["embedding"], **attractor})
+        return seen[-1], seen
+
+    goal, memory = look(shown)
+    _, seen = look(images)
+    state = _zeros(signature.generator(size.generator_state))
+    state |= {
+        "attractor_first": seen[0]["attractor"],
+        "attractor_start": memory[0]["attractor"],
+        "attractor_goal": goal["attractor"],
+        "embedding_goal": goal["embedding"],
+    }
+    rows = []
+    for now in seen:
+        state |= {"attractor_now": now["attractor"], "embedding_now": now["embedding"]}
+        out = _call(sessions["generator"], state)
+        state |= {"h": out["h_next"], "c": out["c_next"]}
+        parts = [out["waypoint_m"][0], out["progress"], out["on_route"], now["embedding"][0]]
+        rows.append(np.concatenate(parts))
+    return np.stack(rows)
+
+
+def _zeros(graph: signature.Graph) -> Arrays:
+    return {t.name: np.zeros(t.shape, np.float32) for t in graph.inputs}
+
+
+def _call(session: onnxruntime.InferenceSession, inputs: Arrays) -> Arrays:
+    names = [output.name for output in session.get_outputs()]
+    return dict(zip(names, session.run(names, inputs), strict=True))

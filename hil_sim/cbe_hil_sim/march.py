@@ -1,0 +1,325 @@
+"""Compiled front-to-back march over the cells of a world: images and scans.
+
+One file, because numba's cache does not notice a change in another file.
+"""
+
+import math
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from cbe_hil_sim.world import (
+    SHADE_DOWN,
+    SHADE_NEGATIVE_X,
+    SHADE_NEGATIVE_Y,
+    SHADE_POSITIVE_X,
+    SHADE_POSITIVE_Y,
+    SHADE_UP,
+)
+from cbe_hil_sim.worldbatch import HOLDS, LEVELS, REACH, TEXTURE_SIZE
+
+NEAR_M = 1e-4  # depth of the face seen by a camera that stands inside a solid
+FAR = 1e5  # keeps what a level row would hit finite
+LEVEL_START = np.array([(4**LEVELS - 4 ** (LEVELS - n)) // 3 for n in range(LEVELS)], np.int64)
+SIDE, CAP, SPAN = 0, 1, 2  # columns of WorldBatch.surface
+FLOOR, CEILING = 0, 1  # columns of WorldBatch.level
+ALONG_X, ALONG_Y = 0, 1  # normal of a vertical face
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _advance(
+    x: float, y: float, dx: float, dy: float, per_dx: float, per_dy: float,
+    column: int, row: int, reach: int,
+) -> tuple[int, int, float, int]:  # fmt: skip
+    """Leave the box of `reach` - 1 cells round a cell: next column, row, ray length, normal.
+
+    Position and direction are in cells, `per_dx` and `per_dy` are the direction's reciprocals
+    (+inf for 0); the ray length is in units of the direction.
+    """
+    to_x = ((column + reach if dx >= 0.0 else column + 1 - reach) - x) * per_dx
+    to_y = ((row + reach if dy >= 0.0 else row + 1 - reach) - y) * per_dy
+    if to_x < to_y:
+        across = int(math.floor(y + to_x * dy))
+        row = min(max(across, row + 1 - reach), row + reach - 1)  # against rounding
+        return column + (reach if dx >= 0.0 else -reach), row, to_x, ALONG_X
+    across = int(math.floor(x + to_y * dx))
+    column = min(max(across, column + 1 - reach), column + reach - 1)
+    return column, row + (reach if dy >= 0.0 else -reach), to_y, ALONG_Y
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _paint(
+    batch: Any, surface: int, normal: int, shade: float, u_at: float, v_at: float,
+    v_step: float, footprint: float, first: int, last: int, filled: Any, colour: Any,
+) -> None:  # fmt: skip
+    """Paint the open sub-rows first..last of a vertical face, from `v_at` (m) by `v_step`."""
+    placement = batch.placement[surface]
+    level = int(footprint + placement[5] + 0.5)
+    level = min(max(level, 0), LEVELS - 1)
+    size = TEXTURE_SIZE >> level
+    mask = size - 1
+    start = batch.texture[surface] + LEVEL_START[level]
+    u = (u_at - placement[1 if normal == ALONG_X else 0]) * placement[3]
+    start += (int(math.floor(u * size)) & mask) * size
+    v_scale = placement[4] * size
+    v = (v_at - placement[2]) * v_scale
+    v_step *= v_scale
+    red = np.float32(batch.tint[surface, 0] * shade)
+    green = np.float32(batch.tint[surface, 1] * shade)
+    blue = np.float32(batch.tint[surface, 2] * shade)
+    white = np.float32(255.0)
+    for sub_row in range(first, last + 1):
+        if filled[sub_row] == 0:
+            filled[sub_row] = 1
+            texel = start + (~int(math.floor(v + (sub_row - first) * v_step)) & mask)
+            colour[sub_row, 0] = min(batch.texels[texel, 0] * red, white)
+            colour[sub_row, 1] = min(batch.texels[texel, 1] * green, white)
+            colour[sub_row, 2] = min(batch.texels[texel, 2] * blue, white)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _paint_plane(
+    batch: Any, surface: int, shade: float, x_m: float, y_m: float, dx_m: float, dy_m: float,
+    rise_m: float, depth_per_rise: Any, footprint: Any, first: int, last: int,
+    filled: Any, colour: Any,
+) -> None:  # fmt: skip
+    """Paint the open sub-rows first..last of a horizontal plane `rise_m` above the camera."""
+    placement = batch.placement[surface]
+    u = (x_m - placement[0]) * placement[3]
+    v = (y_m - placement[1]) * placement[4]
+    du = rise_m * dx_m * placement[3]
+    dv = rise_m * dy_m * placement[4]
+    detail = math.log2(max(abs(rise_m), NEAR_M)) + placement[5] + 0.5
+    start = batch.texture[surface]
+    red = np.float32(batch.tint[surface, 0] * shade)
+    green = np.float32(batch.tint[surface, 1] * shade)
+    blue = np.float32(batch.tint[surface, 2] * shade)
+    white = np.float32(255.0)
+    for sub_row in range(first, last + 1):
+        if filled[sub_row] == 0:
+            filled[sub_row] = 1
+            level = min(max(int(footprint[sub_row] + detail), 0), LEVELS - 1)
+            size = TEXTURE_SIZE >> level
+            mask = size - 1
+            depth = depth_per_rise[sub_row]
+            across = int(math.floor((u + depth * du) * size)) & mask
+            down = ~int(math.floor((v + depth * dv) * size)) & mask
+            texel = start + LEVEL_START[level] + across * size + down
+            colour[sub_row, 0] = min(batch.texels[texel, 0] * red, white)
+            colour[sub_row, 1] = min(batch.texels[texel, 1] * green, white)
+            colour[sub_row, 2] = min(batch.texels[texel, 2] * blue, white)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _render_image(
+    batch: Any, world: int, camera_x_m: float, camera_y_m: float, yaw: float, camera_z_m: float,
+    fx: float, fy: float, cx: float, cy: float, supersample: int, image: Any,
+) -> None:  # fmt: skip
+    """Render one view; intrinsics are those of the super-sampled image."""
+    rows, columns = batch.shape[world]
+    first_cell, first_surface = batch.first_cell[world], batch.first_surface[world]
+    cell_m, ceiling_m = batch.resolution_m[world], batch.ceiling_m[world]
+    x = (camera_x_m - batch.origin_m[world, 0]) / cell_m
+    y = (camera_y_m - batch.origin_m[world, 1]) / cell_m
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    sub_rows = image.shape[0] * supersample
+    middle = cy - 0.5  # sub-row of the horizon
+    log2_focal = 0.5 * math.log2(fx * fy)
+    # Of a horizontal plane: depth per metre above the camera, and log2 of a sub-row's extent
+    # (mean of along and across) but for the plane's own log2 height.
+    depth_per_rise = np.empty(sub_rows)
+    footprint = np.empty(sub_rows)
+    for sub_row in range(sub_rows):
+        slope = (middle - sub_row) / fy
+        depth_per_rise[sub_row] = 1.0 / slope if abs(slope) > 1.0 / FAR else FAR
+        footprint[sub_row] = 1.5 * math.log2(abs(depth_per_rise[sub_row])) - log2_focal
+    filled = np.empty(sub_rows, np.uint8)
+    colour = np.empty((sub_rows, 3), np.float32)
+    total = np.zeros((image.shape[0], 3), np.float32)
+    scale = np.float32(1.0 / (supersample * supersample))
+
+    for sub_column in range(image.shape[1] * supersample):
+        filled[:] = 0
+        left = (cx - (sub_column + 0.5)) / fx
+        dx_m, dy_m = cos - sin * left, sin + cos * left
+        dx, dy = dx_m / cell_m, dy_m / cell_m
+        per_dx = 1.0 / dx if dx != 0.0 else np.inf
+        per_dy = 1.0 / dy if dy != 0.0 else np.inf
+        shade_x = SHADE_NEGATIVE_X if dx > 0.0 else SHADE_POSITIVE_X
+        shade_y = SHADE_NEGATIVE_Y if dy > 0.0 else SHADE_POSITIVE_Y
+        # A wall seen at a slant covers more of itself in one column.
+        slant_x = -0.5 * math.log2(max(abs(dx_m), 1e-3)) - log2_focal
+        slant_y = -0.5 * math.log2(max(abs(dy_m), 1e-3)) - log2_focal
+        column, row = int(math.floor(x)), int(math.floor(y))
+        inside = 0 <= column < columns and 0 <= row < rows
+        cell = first_cell + min(max(row, 0), rows - 1) * columns + min(max(column, 0), columns - 1)
+        near, normal = NEAR_M, ALONG_X
+        top, bottom = 0, sub_rows - 1  # sub-rows that may still be open
+        solid_before = span_bottom_before = span_top_before = 0.0
+        while True:
+            next_column, next_row, far, next_normal = column, row, near, normal
+            solid, span_bottom, span_top = ceiling_m, 0.0, 0.0
+            if inside:
+                next_column, next_row, far, next_normal = _advance(
+                    x, y, dx, dy, per_dx, per_dy, column, row, np.int64(batch.skip[cell] & REACH)
+                )
+                if batch.skip[cell] & HOLDS == 0:
+                    column, row, near, normal = next_column, next_row, far, next_normal
+                    inside = 0 <= column < columns and 0 <= row < rows
+                    if inside:
+                        cell = first_cell + row * columns + column
+                    solid_before = span_bottom_before = span_top_before = 0.0
+                    continue
+                heights = batch.heights_m[cell]
+                solid, span_bottom, span_top = heights[0], heights[1], heights[2]
+            near = max(near, NEAR_M)
+            far = max(far, near)
+            per_m = fy / near  # sub-rows per metre of height at the near edge
+            top = max(top, int(math.ceil(middle - (ceiling_m - camera_z_m) * per_m)))
+            bottom = min(bottom, int(math.floor(middle + camera_z_m * per_m)))
+
+            shade, along_m = shade_x, camera_y_m + near * dy_m
+            slant = slant_x
+            if normal == ALONG_Y:
+                shade, along_m, slant = shade_y, camera_x_m + near * dx_m, slant_y
+            if solid > solid_before:
+                first = max(top, int(math.ceil(middle - (solid - camera_z_m) * per_m)))
+                last = min(bottom, int(math.floor(middle - (solid_before - camera_z_m) * per_m)))
+                if first <= last:
+                    _paint(
+                        batch, first_surface + batch.surface[cell, SIDE], normal, shade, along_m,
+                        camera_z_m + (middle - first) / per_m, -1.0 / per_m,
+                        math.log2(near) + slant, first, last, filled, colour,
+                    )  # fmt: skip
+            if solid >= ceiling_m:
+                break
+            new_span = span_bottom < span_bottom_before or span_top > span_top_before
+            if span_top > 0.0 and new_span:
+                first = max(top, int(math.ceil(middle - (span_top - camera_z_m) * per_m)))
+                last = min(bottom, int(math.floor(middle - (span_bottom - camera_z_m) * per_m)))
+                if first <= last:
+                    _paint(
+                        batch, first_surface + batch.surface[cell, SPAN], normal, shade, along_m,
+                        camera_z_m + (middle - first) / per_m, -1.0 / per_m,
+                        math.log2(near) + slant, first, last, filled, colour,
+                    )  # fmt: skip
+
+            for face in range(3):  # span's upper face, span's underside, solid's cap
+                height_m, surface, shade = span_top, SPAN, SHADE_UP
+                if face == 1:
+                    height_m, shade = span_bottom, SHADE_DOWN
+                elif face == 2:
+                    height_m, surface = solid, CAP
+                under = face == 1
+                rise = height_m - camera_z_m
+                if height_m <= 0.0 or (face < 2 and span_top <= 0.0) or under != (rise > 0.0):
+                    continue
+                at_near, at_far = middle - rise * per_m, middle - rise * fy / far
+                first = max(top, int(math.ceil(at_near if under else at_far)))
+                last = min(bottom, int(math.floor(at_far if under else at_near)))
+                if first > last or rise == 0.0:
+                    continue
+                _paint_plane(
+                    batch, first_surface + batch.surface[cell, surface], shade, camera_x_m,
+                    camera_y_m, dx_m, dy_m, rise, depth_per_rise, footprint, first, last,
+                    filled, colour,
+                )  # fmt: skip
+
+            while top <= bottom and filled[top] != 0:
+                top += 1
+            while top <= bottom and filled[bottom] != 0:
+                bottom -= 1
+            if top > bottom:
+                break
+            column, row, near, normal = next_column, next_row, far, next_normal
+            solid_before, span_bottom_before, span_top_before = solid, span_bottom, span_top
+            inside = 0 <= column < columns and 0 <= row < rows
+            if inside:
+                cell = first_cell + row * columns + column
+
+        # What is still open sees the floor or the ceiling, painted in runs of one surface.
+        horizon = min(max(int(math.ceil(middle)), 0), sub_rows)
+        for plane in range(2):
+            rise, shade, first, end = -camera_z_m, SHADE_UP, horizon, sub_rows
+            if plane == CEILING:
+                rise, shade, first, end = ceiling_m - camera_z_m, SHADE_DOWN, 0, horizon
+            surface = -1
+            for sub_row in range(first, end):
+                if filled[sub_row] == 0:
+                    depth = rise * depth_per_rise[sub_row]
+                    column = min(max(int(math.floor(x + depth * dx)), 0), columns - 1)
+                    row = min(max(int(math.floor(y + depth * dy)), 0), rows - 1)
+                    here = np.int64(batch.level[first_cell + row * columns + column, plane])
+                    if here != surface:
+                        if surface >= 0:
+                            _paint_plane(
+                                batch, first_surface + surface, shade, camera_x_m, camera_y_m,
+                                dx_m, dy_m, rise, depth_per_rise, footprint, first, sub_row - 1,
+                                filled, colour,
+                            )  # fmt: skip
+                        surface, first = here, sub_row
+            if surface >= 0:
+                _paint_plane(
+                    batch, first_surface + surface, shade, camera_x_m, camera_y_m, dx_m, dy_m,
+                    rise, depth_per_rise, footprint, first, end - 1, filled, colour,
+                )  # fmt: skip
+        sub_row = 0
+        for pixel_row in range(image.shape[0]):
+            for _ in range(supersample):
+                for channel in range(3):
+                    total[pixel_row, channel] += colour[sub_row, channel]
+                sub_row += 1
+        if (sub_column + 1) % supersample == 0:
+            pixel_column = sub_column // supersample
+            for pixel_row in range(image.shape[0]):
+                for channel in range(3):
+                    mean = total[pixel_row, channel] * scale
+                    image[pixel_row, pixel_column, channel] = np.uint8(mean + np.float32(0.5))
+            total[:] = 0.0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", parallel=True)
+def render_images(
+    batch: Any, world_index: Any, camera_pose: Any, camera_z_m: Any, horizon_px: Any,
+    fx: float, fy: float, cx: float, supersample: int, images: Any,
+) -> None:  # fmt: skip
+    """Fill images (B, h, w, 3) from camera poses (B, 3); horizon_px (B,) is the row of level."""
+    for b in numba.prange(len(images)):
+        _render_image(
+            batch, world_index[b], camera_pose[b, 0], camera_pose[b, 1], camera_pose[b, 2],
+            camera_z_m[b], fx * supersample, fy * supersample, cx * supersample,
+            horizon_px[b] * supersample, supersample, images[b],
+        )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", parallel=True)
+def scan_rays(
+    batch: Any, world_index: Any, sensor_pose: Any, angles_rad: Any, height_m: float,
+    range_m: float, scans_m: Any,
+) -> None:  # fmt: skip
+    """Fill scans (B, rays): distance to the first cell that holds something at `height_m`."""
+    for b in numba.prange(len(scans_m)):
+        world = world_index[b]
+        rows, columns = batch.shape[world]
+        first_cell, cell_m = batch.first_cell[world], batch.resolution_m[world]
+        x = (sensor_pose[b, 0] - batch.origin_m[world, 0]) / cell_m
+        y = (sensor_pose[b, 1] - batch.origin_m[world, 1]) / cell_m
+        for ray in range(len(angles_rad)):
+            angle = sensor_pose[b, 2] + angles_rad[ray]
+            dx, dy = math.cos(angle) / cell_m, math.sin(angle) / cell_m
+            per_dx = 1.0 / dx if dx != 0.0 else np.inf
+            per_dy = 1.0 / dy if dy != 0.0 else np.inf
+            column, row = int(math.floor(x)), int(math.floor(y))
+            distance = 0.0
+            while distance <= range_m and 0 <= column < columns and 0 <= row < rows:
+                cell = first_cell + row * columns + column
+                if batch.skip[cell] & HOLDS:
+                    heights = batch.heights_m[cell]
+                    if heights[0] >= height_m or heights[1] <= height_m <= heights[2]:
+                        break
+                column, row, distance, _ = _advance(
+                    x, y, dx, dy, per_dx, per_dy, column, row, np.int64(batch.skip[cell] & REACH)
+                )
+            scans_m[b, ray] = max(distance, 0.0) if distance <= range_m else np.inf

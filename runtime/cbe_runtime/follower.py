@@ -1,0 +1,283 @@
+"""Repeats a route: one decision a step from image and scan, without any I/O (paper, Sec. III)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from cbe.controller import Motion, RmpController, twist
+from cbe.errors import ModelError
+from cbe.robot import STEP_S, Robot
+from cbe.stop_zone import limit
+
+from cbe_runtime.observation import Observation, StampWatch, usable_image, usable_ranges
+from cbe_runtime.state import Events, Reason, State, StateMachine
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from cbe_runtime.networks import Networks, Prediction
+    from cbe_runtime.observation import Frame
+    from cbe_runtime.route import Route
+
+ARRIVED_RANGE_M = 0.03
+"""Nearer than this the last waypoint counts as reached: below the stopping jerk of one step."""
+
+
+@dataclass(frozen=True, slots=True)
+class FollowerConfig:
+    """How the follower switches, arrives and gives up."""
+
+    fresh_s: float = 0.3  # an older image or scan stops the robot
+    switch_progress: float = 0.95  # phi >= 0.95 starts the next behavior, Sec. III-D
+    arrival_progress: float = 0.95  # the same on the last behavior means ARRIVED
+    progress_ticks: int = 2  # network ticks in a row that must agree, against flicker
+    timeout_factor: float = 3.0  # a segment may take this many times the demonstration's steps
+    timeout_steps: int = 100  # ... and this many more
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What to command in this step, and why.
+
+    `progress` is of the present segment; `waypoint_m` (x, y) in base_link at the present pose;
+    ages are since receipt, inf where nothing was received; `standing` is the robot's own belief
+    (the command and the braking that precedes it), `ticked` whether the networks ran.
+    """
+
+    speed_mps: float
+    yaw_rate_rad_s: float
+    state: State
+    reason: Reason | None
+    segment: int
+    segments: int
+    progress: float
+    on_route: float
+    waypoint_m: tuple[float, float] | None
+    camera_age_s: float
+    scan_age_s: float
+    standing: bool
+    ticked: bool
+
+
+class Follower:
+    """Drives one robot along one route, a behavior at a time.
+
+    `start` and `stop` take effect in the next `step`. A start from IDLE or ARRIVED begins at the
+    route's first segment, one from STOPPED goes on where it was.
+
+    Raises:
+        RouteError: the route was taught with another model.
+    """
+
+    def __init__(
+        self,
+        networks: Networks,
+        route: Route,
+        robot: Robot | None = None,
+        config: FollowerConfig | None = None,
+    ) -> None:
+        route.require_model(networks)
+        self._networks = networks
+        self._route = route
+        self._robot = robot or Robot()
+        self._config = config or FollowerConfig()
+        self._controller = RmpController(self._robot)
+        self._camera_watch = StampWatch(
+            self._config.fresh_s, Reason.STALE_CAMERA, Reason.FROZEN_CAMERA
+        )
+        self._scan_watch = StampWatch(self._config.fresh_s, Reason.STALE_SCAN, Reason.FROZEN_SCAN)
+        self._machine = StateMachine()
+        self._start = False
+        self._stop = False
+        self._motion = Motion(np.zeros(1), np.zeros(1))
+        self._restart()
+
+    @property
+    def state(self) -> State:
+        """The state after the last step."""
+        return self._machine.state
+
+    def start(self) -> None:
+        """Ask to follow the route."""
+        self._start = True
+
+    def stop(self) -> None:
+        """Ask to stop until the next start; wins over a start asked for in the same step."""
+        self._stop = True
+
+    def step(self, observation: Observation, now_s: float) -> Decision:
+        """Decide what to command for the next 0.1 s; call once a step.
+
+        Args:
+            observation: newest frame and scan.
+            now_s: on the clock of their `received_s`.
+        """
+        self._carry_waypoint()
+        image, ranges_m, fault = self._judge(observation, now_s)
+        if self._start and self._machine.state in {State.IDLE, State.ARRIVED}:
+            self._restart()
+        elif self._start:
+            self._segment_age_steps = 0
+        self._machine.update(Events(start=self._start, stop=self._stop, fault=fault))
+        self._start = self._stop = False
+
+        ticked = False
+        if self._machine.state is State.FOLLOWING:
+            assert image is not None
+            assert observation.frame is not None
+            ticked = self._follow(image, observation.frame)
+        self._move(ranges_m)
+        return self._decision(observation, now_s, ticked)
+
+    def _judge(
+        self, observation: Observation, now_s: float
+    ) -> tuple[NDArray[np.uint8] | None, NDArray[np.float64] | None, Reason | None]:
+        """Image and ranges where they can be relied on, and the first thing that is wrong."""
+        frame, scan = observation.frame, observation.scan
+        camera_fault = self._camera_watch.fault(frame, now_s)
+        scan_fault = self._scan_watch.fault(scan, now_s)
+        image = None if camera_fault or frame is None else usable_image(frame)
+        ranges_m = None if scan_fault or scan is None else usable_ranges(scan, self._robot)
+        if image is None:
+            return image, ranges_m, camera_fault or Reason.BAD_IMAGE
+        if ranges_m is None:
+            return image, ranges_m, scan_fault or Reason.BAD_SCAN
+        return image, ranges_m, None
+
+    def _follow(self, image: NDArray[np.uint8], frame: Frame) -> bool:
+        """Run the networks if they are due; tells whether they ran."""
+        self._segment_age_steps += 1
+        self._since_tick_steps += 1
+        length = self._route.segments[self._segment].steps
+        if self._segment_age_steps > (
+            self._config.timeout_factor * length + self._config.timeout_steps
+        ):
+            self._machine.update(Events(fault=Reason.TIMEOUT))
+            return False
+        # A frame is seen once, however often it is delivered: the encoder counts frames.
+        due = self._since_tick_steps >= self._networks.network_period
+        if not due or frame.stamp_ns == self._seen_stamp_ns:
+            return False
+        try:
+            prediction = self._tick(image)
+        except ModelError:
+            self._machine.update(Events(fault=Reason.MODEL_FAULT))
+            return False
+        self._since_tick_steps = 0
+        self._seen_stamp_ns = frame.stamp_ns
+        self._prediction = prediction
+        self._waypoint_m = (float(prediction.waypoint_m[0]), float(prediction.waypoint_m[1]))
+        self._judge_progress(prediction.progress)
+        return True
+
+    def _tick(self, image: NDArray[np.uint8]) -> Prediction:
+        """One tick of all networks; the state moves on only if every output was finite."""
+        networks = self._networks
+        features, embedding, encoder_state = networks.encode(image, self._encoder_state)
+        attractor = networks.attract(features)
+        first = attractor if self._attractor_first is None else self._attractor_first
+        prediction, generator_state = networks.generate(
+            attractor_now=attractor,
+            attractor_first=first,
+            attractor_start=self._attractor_start,
+            attractor_goal=self._attractor_goal,
+            embedding_now=embedding,
+            embedding_goal=self._embedding_goal,
+            state=self._generator_state,
+        )
+        self._attractor_first = first
+        self._encoder_state = encoder_state
+        self._generator_state = generator_state
+        return prediction
+
+    def _judge_progress(self, progress: float) -> None:
+        """Start the next behavior, or arrive, once enough ticks in a row say so."""
+        last = self._segment + 1 == len(self._route.segments)
+        threshold = self._config.arrival_progress if last else self._config.switch_progress
+        self._done_ticks = self._done_ticks + 1 if progress >= threshold else 0
+        if self._done_ticks < self._config.progress_ticks:
+            return
+        if last:
+            self._machine.update(Events(arrived=True))
+        else:
+            self._begin(self._segment + 1)
+
+    def _restart(self) -> None:
+        self._seen_stamp_ns: int | None = None
+        self._since_tick_steps = self._networks.network_period
+        self._prediction: Prediction | None = None
+        self._waypoint_m: tuple[float, float] | None = None
+        self._begin(0)
+
+    def _begin(self, segment: int) -> None:
+        """Enter a segment with every recurrent state reset; its first frame is the next one."""
+        self._segment = segment
+        self._attractor_start = self._route.attractor(segment)
+        self._attractor_goal = self._route.attractor(segment + 1)
+        self._embedding_goal = self._route.embedding(segment)
+        self._attractor_first: NDArray[np.float32] | None = None
+        self._encoder_state = self._networks.encoder_state()
+        self._generator_state = self._networks.generator_state()
+        self._done_ticks = 0
+        self._segment_age_steps = 0
+
+    def _move(self, ranges_m: NDArray[np.float64] | None) -> None:
+        """Set the motion commanded for this step."""
+        state = self._machine.state
+        driving = state in {State.FOLLOWING, State.ARRIVED}
+        if not driving or ranges_m is None or self._waypoint_m is None:
+            # The command is zero at once; the estimate follows the robot's own braking.
+            braked = self._motion.speed_mps - self._robot.max_braking_mps2 * STEP_S
+            self._motion = Motion(np.maximum(braked, 0.0), self._motion.steer_rad)
+            self._command = (0.0, 0.0)
+        else:
+            scan_m = ranges_m[None]  # (1, rays)
+            goal_m = np.array([self._waypoint_m])  # (1, 2)
+            motion = self._controller.step(self._motion, goal_m, scan_m)
+            if state is State.ARRIVED:
+                motion = self._coast(motion)
+            self._motion = limit(motion, scan_m, self._robot)
+            speed, yaw_rate = twist(self._motion, self._robot)
+            self._command = (float(speed[0]), float(yaw_rate[0]))
+
+    def _coast(self, motion: Motion) -> Motion:
+        """Come to rest at the last waypoint: never faster than before, nor than can be braked."""
+        assert self._waypoint_m is not None
+        ahead_m = self._waypoint_m[0] - ARRIVED_RANGE_M
+        cap = math.sqrt(2.0 * self._robot.max_braking_mps2 * ahead_m) if ahead_m > 0.0 else 0.0
+        speed = np.minimum(motion.speed_mps, np.minimum(self._motion.speed_mps, cap))
+        return Motion(speed, motion.steer_rad)
+
+    def _carry_waypoint(self) -> None:
+        """Express the held waypoint at the present pose, dead-reckoned over the step gone by."""
+        if self._waypoint_m is None:
+            return
+        speed, yaw_rate = twist(self._motion, self._robot)
+        turn_rad = float(yaw_rate[0]) * STEP_S
+        travel_m = float(speed[0]) * STEP_S
+        x = self._waypoint_m[0] - travel_m * math.cos(0.5 * turn_rad)
+        y = self._waypoint_m[1] - travel_m * math.sin(0.5 * turn_rad)
+        cos, sin = math.cos(turn_rad), math.sin(turn_rad)
+        self._waypoint_m = (cos * x + sin * y, cos * y - sin * x)
+
+    def _decision(self, observation: Observation, now_s: float, ticked: bool) -> Decision:
+        frame, scan = observation.frame, observation.scan
+        prediction = self._prediction
+        return Decision(
+            speed_mps=self._command[0],
+            yaw_rate_rad_s=self._command[1],
+            state=self._machine.state,
+            reason=self._machine.reason,
+            segment=self._segment,
+            segments=len(self._route.segments),
+            progress=prediction.progress if prediction else 0.0,
+            on_route=prediction.on_route if prediction else 0.0,
+            waypoint_m=self._waypoint_m,
+            camera_age_s=now_s - frame.received_s if frame else math.inf,
+            scan_age_s=now_s - scan.received_s if scan else math.inf,
+            standing=float(self._motion.speed_mps[0]) <= 0.0,
+            ticked=ticked,
+        )

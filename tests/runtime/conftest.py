@@ -1,0 +1,158 @@
+"""Tiny random networks in ONNX that keep to the signature, made once a session."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from cbe import signature
+from cbe_runtime.networks import Networks
+from cbe_runtime.route import Precision, Route, Segment
+from onnx import TensorProto, helper, numpy_helper
+
+ELEMENTS = {"tensor(float)": TensorProto.FLOAT, "tensor(uint8)": TensorProto.UINT8}
+STATE = 8
+
+
+def infos(tensors):
+    return [helper.make_tensor_value_info(t.name, ELEMENTS[t.dtype], t.shape) for t in tensors]
+
+
+def write(folder, graph, nodes, weights, **metadata):
+    constants = [numpy_helper.from_array(value, name) for name, value in weights.items()]
+    body = helper.make_graph(
+        nodes, graph.name, infos(graph.inputs), infos(graph.outputs), initializer=constants
+    )
+    model = helper.make_model(body, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    stored = {
+        "cbe.contract_version": str(signature.CONTRACT_VERSION),
+        "cbe.model_id": "00112233445566aa",
+        "cbe.network_period": "2",
+        "cbe.camera": json.dumps(
+            {
+                "width": 64,
+                "height": 64,
+                "fx": 18.48,
+                "fy": 23.68,
+                "cx": 32.0,
+                "cy": 32.0,
+                "model": "pinhole",
+                "distortion": [],
+            }
+        ),
+        "cbe.segment_steps": "40",
+        "cbe.precision": "fp32",
+    } | metadata
+    helper.set_model_props(model, {k: v for k, v in stored.items() if v is not None})
+    onnx.checker.check_model(model)
+    onnx.save(model, folder / f"{graph.name}.onnx")
+
+
+def encoder_nodes(rng):
+    """Features are a pooled image; the state counts frames; z is the mean of the image."""
+    weights = {
+        "axes": np.array([1, 2, 3], np.int64),
+        "scale": np.float32([1 / 255]),
+        "one": np.float32([1.0]),
+        "spread": rng.normal(size=(signature.FEATURES[0], 3, 1, 1)).astype(np.float32),
+        "to_z": rng.normal(size=(STATE, signature.EMBEDDING_SIZE)).astype(np.float32),
+    }
+    nodes = [
+        helper.make_node("Cast", ["image"], ["float"], to=TensorProto.FLOAT),
+        helper.make_node("Mul", ["float", "scale"], ["unit"]),
+        helper.make_node("Transpose", ["unit"], ["nchw"], perm=[0, 3, 1, 2]),
+        helper.make_node("AveragePool", ["nchw"], ["pooled"], kernel_shape=[4, 4], strides=[4, 4]),
+        helper.make_node("Conv", ["pooled", "spread"], ["features"]),
+        helper.make_node("ReduceMean", ["previous_features"], ["past"], axes=[1, 2, 3], keepdims=0),
+        helper.make_node("ReduceMean", ["features"], ["present"], axes=[1, 2, 3], keepdims=0),
+        helper.make_node("Sub", ["one", "is_first"], ["again"]),
+        helper.make_node("Mul", ["h", "again"], ["kept"]),
+        helper.make_node("Add", ["kept", "one"], ["h_next"]),
+        helper.make_node("Add", ["past", "present"], ["both"]),
+        helper.make_node("Add", ["c", "both"], ["c_next"]),
+        helper.make_node("MatMul", ["h_next", "to_z"], ["embedding"]),
+    ]
+    weights.pop("axes")
+    return nodes, weights
+
+
+def attractor_nodes(rng):
+    weights = {"mix": rng.normal(size=(signature.FEATURES[0], signature.ATTRACTOR_SIZE)).astype(np.float32)}
+    nodes = [
+        helper.make_node("ReduceMean", ["features"], ["mean"], axes=[2, 3], keepdims=0),
+        helper.make_node("MatMul", ["mean", "mix"], ["mixed"]),
+        helper.make_node("Sigmoid", ["mixed"], ["attractor"]),
+    ]
+    return nodes, weights
+
+
+def generator_nodes(ticks_to_goal, waypoint_m):
+    """Progress counts ticks since the behavior began; the waypoint is always straight ahead."""
+    weights = {
+        "one": np.float32([[1.0]]),
+        "rate": np.full((STATE, 1), 1.0 / STATE / ticks_to_goal, np.float32),
+        "ahead": np.float32([list(waypoint_m)]),
+        "zero": np.float32([0.0]),
+        "flat": np.array([1], np.int64),
+    }
+    inputs = [t.name for t in signature.generator(STATE).inputs[:6]]
+    nodes = [
+        helper.make_node("Add", ["h", "one"], ["h_next"]),
+        helper.make_node("Identity", ["c"], ["c_next"]),
+        helper.make_node("MatMul", ["h_next", "rate"], ["share"]),
+        helper.make_node("Reshape", ["share", "flat"], ["progress"]),
+        helper.make_node("Concat", inputs, ["all"], axis=1),
+        helper.make_node("ReduceMean", ["all"], ["used"], axes=[1], keepdims=0),
+        helper.make_node("Mul", ["used", "zero"], ["nothing"]),
+        helper.make_node("Add", ["ahead", "nothing"], ["waypoint_m"]),
+        helper.make_node("Sigmoid", ["used"], ["on_route"]),
+    ]
+    return nodes, weights
+
+
+def make_model(folder, ticks_to_goal=20, waypoint_m=(0.5, 0.0), **metadata):
+    """Write a tiny model whose progress rises by 1/ticks_to_goal a tick."""
+    rng = np.random.default_rng(0)
+    folder.mkdir(parents=True, exist_ok=True)
+    write(folder, signature.encoder(STATE), *encoder_nodes(rng), **metadata)
+    write(folder, signature.attractor(), *attractor_nodes(rng), **metadata)
+    write(folder, signature.generator(STATE), *generator_nodes(ticks_to_goal, waypoint_m), **metadata)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def model_folder(tmp_path_factory) -> Path:
+    return make_model(tmp_path_factory.mktemp("model"))
+
+
+@pytest.fixture(scope="session")
+def networks(model_folder) -> Networks:
+    return Networks.load(model_folder)
+
+
+@pytest.fixture(scope="session")
+def model_writer():
+    return make_model
+
+
+@pytest.fixture
+def route(networks) -> Route:
+    """Two segments of 30 steps."""
+    rng = np.random.default_rng(1)
+    precision = Precision()
+    return Route(
+        model_id=networks.model_id,
+        camera=networks.camera,
+        network_period=networks.network_period,
+        precision=precision,
+        attractors=tuple(
+            precision.attractor.pack(rng.random(signature.ATTRACTOR_SIZE, np.float32))
+            for _ in range(3)
+        ),
+        segments=tuple(
+            Segment(precision.embedding.pack(rng.random(signature.EMBEDDING_SIZE, np.float32)), 30)
+            for _ in range(2)
+        ),
+        tags={"name": "hall"},
+    )

@@ -1,0 +1,129 @@
+"""Checkpoints: safetensors and a JSON of everything else, enough to go on exactly."""
+
+import json
+import logging
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from cbe.errors import ModelError
+from cbe_training.config import LossWeights, TrainConfig
+from cbe_training.losses import AuxiliaryHeads
+from cbe_training.networks import BehaviorNetworks, NetworkConfig
+
+logger = logging.getLogger(__name__)
+
+
+def config_from_json(text: str) -> TrainConfig:
+    """Rebuild the configuration that `save` wrote."""
+    values = json.loads(text)["config"]
+    network = values.pop("network")
+    network = {k: tuple(v) if isinstance(v, list) else v for k, v in network.items()}
+    loss = LossWeights(**values.pop("loss"))
+    return TrainConfig(**values, network=NetworkConfig(**network), loss=loss)
+
+
+def load_networks(folder: Path) -> BehaviorNetworks:
+    """The averaged networks of a checkpoint folder, as they are exported.
+
+    Raises ModelError if the folder holds no checkpoint.
+    """
+    state, weights = folder / "state.json", folder / "average.safetensors"
+    for path in (state, weights):
+        if not path.is_file():
+            raise ModelError(f"no checkpoint at {folder}: {path.name} is missing; run cbe-train")
+    networks = BehaviorNetworks(config_from_json(state.read_text()).network)
+    networks.load_state_dict(load_file(weights))
+    return networks.eval()
+
+
+class Learner:
+    """What changes while training: networks, heads, optimiser, moving average, iteration."""
+
+    def __init__(self, config: TrainConfig, device: torch.device) -> None:
+        torch.manual_seed(config.seed)
+        self.config = config
+        self.device = device
+        self.networks = BehaviorNetworks(config.network).to(device)
+        self.heads = AuxiliaryHeads(config.network).to(device)
+        self.average = BehaviorNetworks(config.network).to(device)
+        self.average.load_state_dict(self.networks.state_dict())
+        self.optimizer = torch.optim.AdamW(
+            self.parameters,
+            lr=config.learning_rate,
+            weight_decay=config.weight_decay,
+        )
+        self.iteration = 0
+        self.updates = 0
+        self.sequences = 0
+        self.seconds = 0.0
+
+    @property
+    def parameters(self) -> list[torch.nn.Parameter]:
+        """Everything the optimiser moves."""
+        return [*self.networks.parameters(), *self.heads.parameters()]
+
+    def update_average(self) -> None:
+        """Move the averaged weights towards the present ones."""
+        decay = min(self.config.average_decay, (1 + self.updates) / (10 + self.updates))
+        with torch.no_grad():
+            for mean, value in zip(
+                self.average.parameters(), self.networks.parameters(), strict=True
+            ):
+                mean.lerp_(value, 1.0 - decay)
+
+    def save(self, folder: Path) -> None:
+        """Write all files; each replaces the old one only when whole."""
+        folder.mkdir(parents=True, exist_ok=True)
+        moments: dict[str, dict[str, Tensor]] = {"exp_avg": {}, "exp_avg_sq": {}}
+        for index, values in self.optimizer.state_dict()["state"].items():
+            for name, kept in moments.items():
+                kept[str(index)] = values[name]
+        _save(folder / "average.safetensors", self.average.state_dict())
+        _save(folder / "networks.safetensors", self.networks.state_dict())
+        _save(folder / "heads.safetensors", self.heads.state_dict())
+        for name, kept in moments.items():
+            _save(folder / f"{name}.safetensors", kept)
+        state = {
+            "config": asdict(self.config),
+            "iteration": self.iteration,
+            "updates": self.updates,
+            "sequences": self.sequences,
+            "seconds": round(self.seconds, 1),
+        }
+        temporary = folder / "state.json.part"
+        temporary.write_text(json.dumps(state, indent=1) + "\n")
+        temporary.replace(folder / "state.json")
+
+    def load(self, folder: Path) -> None:
+        """Go on where `save` left off; without the optimiser's moments, start those afresh."""
+        self.networks.load_state_dict(load_file(folder / "networks.safetensors"))
+        self.average.load_state_dict(load_file(folder / "average.safetensors"))
+        self.heads.load_state_dict(load_file(folder / "heads.safetensors"))
+        state = json.loads((folder / "state.json").read_text())
+        self.iteration, self.updates = state["iteration"], state["updates"]
+        self.sequences, self.seconds = state["sequences"], state["seconds"]
+        names = ("exp_avg", "exp_avg_sq")
+        if not all((folder / f"{name}.safetensors").is_file() for name in names):
+            logger.warning("%s holds no optimiser moments: they start afresh", folder)
+            return
+        first, second = (load_file(folder / f"{name}.safetensors") for name in names)
+        optimizer = self.optimizer.state_dict()
+        optimizer["state"] = {
+            int(index): {
+                "step": torch.tensor(float(self.updates)),
+                "exp_avg": first[index],
+                "exp_avg_sq": second[index],
+            }
+            for index in first
+        }
+        self.optimizer.load_state_dict(optimizer)
+
+
+def _save(path: Path, tensors: dict[str, Tensor]) -> None:
+    temporary = path.with_suffix(".part")
+    save_file({name: value.contiguous().cpu() for name, value in tensors.items()}, temporary)
+    temporary.replace(path)

@@ -1,0 +1,60 @@
+"""Command line of cbe-train."""
+
+import argparse
+import logging
+import os
+import sys
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import torch
+
+from cbe.errors import CbeError
+from cbe_training import team
+from cbe_training.config import TrainConfig
+from cbe_training.train import train
+
+
+def main() -> int:
+    """Train, resuming whatever the run's folder holds; returns an exit code."""
+    parser = argparse.ArgumentParser(
+        prog="cbe-train", description="Train the behavior networks on simulated drives."
+    )
+    parser.add_argument("--run", type=Path, default=Path("runs/default"), help="folder of the run")
+    parser.add_argument("--hours", type=float, default=1.0, help="how much longer to train")
+    parser.add_argument(
+        "--decay-hours", type=float, default=0.0, help="let the learning rate fall at the end"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="worlds and draws of this run")
+    parser.add_argument("--worlds", type=int, default=TrainConfig().worlds)
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument(
+        "--workers", type=int, default=0, help="processes (default: one a core, one with a GPU)"
+    )
+    arguments = parser.parse_args()
+    device = torch.device(arguments.device)
+    workers = arguments.workers or (1 if device.type != "cpu" else os.cpu_count() or 1)
+    config = replace(TrainConfig(), seed=arguments.seed, worlds=arguments.worlds)
+    work = partial(
+        _work, config, arguments.run, arguments.hours, arguments.decay_hours, device
+    )
+    try:
+        team.run(work, workers)
+    except CbeError as error:
+        sys.stderr.write(f"cbe-train: {error}\n")
+        return 1
+    return 0
+
+
+def _work(
+    config: TrainConfig,
+    folder: Path,
+    hours: float,
+    decay_hours: float,
+    device: torch.device,
+    member: team.Team,
+) -> None:
+    level = logging.INFO if member.rank == 0 else logging.WARNING
+    logging.basicConfig(level=level, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
+    train(config, folder, hours, device, member, decay_hours)

@@ -1,0 +1,61 @@
+"""One frozen configuration of a training run, stored beside every checkpoint."""
+
+from dataclasses import dataclass, field
+
+from cbe_training.networks import NetworkConfig
+
+
+@dataclass(frozen=True, slots=True)
+class LossWeights:
+    """Weights of the loss terms; the auxiliary ones make a small budget enough."""
+
+    waypoint: float = 2.0
+    progress: float = 2.0
+    on_route: float = 0.1
+    motion: float = 1.0  # relative pose of consecutive frames
+    displacement: float = 0.5  # pose since the start, from every z
+    shape: float = 0.5  # the path's points, from the final z
+    relation: float = 0.3  # relative pose of two views, from their attractors
+
+
+@dataclass(frozen=True, slots=True)
+class TrainConfig:
+    """Sizes are episodes; lengths are network frames unless they end in `_steps`."""
+
+    seed: int = 0
+    worlds: int = 100
+    drives_per_world: int = 40
+    demonstrations: int = 48  # behaviors shown in one iteration
+    repeats: int = 2  # rollouts of each, from different starts
+    epochs: int = 2  # times each rollout is trained on
+    minibatch: int = 16  # behaviors in one update
+    learning_rate: float = 1e-3
+    warmup_updates: int = 100
+    weight_decay: float = 1e-4
+    clip_norm: float = 1.0
+    average_decay: float = 0.998  # of the exported moving average of the weights
+    cloning_iterations: int = 110  # expert at the wheel, short behaviors
+    annealing_iterations: int = 130  # the expert's share falls from 1 to 0
+    expert_episodes: float = 0.2  # always driven by the (noisy) expert
+    wrong_episodes: float = 0.06  # shown another behavior's memory
+    joining_episodes: float = 0.1  # start in the middle of the behavior
+    lookahead_m: float = 0.6
+    off_route_m: float = 1.0  # a rollout further off its demonstration ends
+    jitter_m: float = 0.3
+    jitter_rad: float = 0.2356  # 13.5 deg
+    validation_every: int = 40
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    loss: LossWeights = field(default_factory=LossWeights)
+
+    def frames(self, iteration: int) -> tuple[int, int]:
+        """Shortest and longest behavior of an iteration, in network frames."""
+        if iteration < self.cloning_iterations:
+            return 12, 28
+        if iteration < self.cloning_iterations + self.annealing_iterations:
+            return 22, 44
+        return 30, 66
+
+    def expert_share(self, iteration: int) -> float:
+        """Probability that a tick is driven by the expert's waypoint."""
+        past = iteration - self.cloning_iterations
+        return min(1.0, max(0.0, 1.0 - past / self.annealing_iterations))

@@ -1,0 +1,209 @@
+"""The end-to-end loss (paper, Sec. IV-A) and auxiliary heads that are dropped at export."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from cbe import geometry, signature
+from cbe_training.config import LossWeights
+from cbe_training.networks import BehaviorNetworks, NetworkConfig, quantise
+from cbe_training.policy import CHUNK
+from cbe_training.rollout import Behaviors, Rollouts
+
+SHAPE_POINTS = 8
+LEVELS = (0, 255, 15, 15)  # attractors stored exactly, at 8 bits, at 4 bits
+OVERLAP_M, OVERLAP_RAD = 2.0, np.radians(60.0)  # beyond, two views share too little
+
+
+class AuxiliaryHeads(nn.Module):
+    """Read poses off the inner features; each is a short way for the gradient to what matters."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.motion = nn.Linear(config.motion, 3)
+        self.displacement = _perceptron(signature.EMBEDDING_SIZE, 4)
+        self.shape = _perceptron(signature.EMBEDDING_SIZE, 2 * SHAPE_POINTS)
+        self.relation = _perceptron(config.relation, 4)
+
+
+def _perceptron(inputs: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(inputs, 128), nn.ReLU(), nn.Linear(128, outputs))
+
+
+@dataclass(frozen=True, slots=True)
+class Minibatch:
+    """D behaviors and their B repetitions as tensors; labels in metres and radians."""
+
+    shown_images: Tensor  # (D, T, 64, 64, 3) uint8
+    shown_motion: Tensor  # (D, T, 3) pose of each frame in the one before
+    shown_displacement: Tensor  # (D, T, 4) x, y, cos, sin since the first frame
+    shape: Tensor  # (D, 16) points along the path, in the first frame's frame
+    images: Tensor  # (B, S, 64, 64, 3) uint8
+    motion: Tensor  # (B, S, 3)
+    displacement: Tensor  # (B, S, 4)
+    goal: Tensor  # (B, S, 4) the goal's pose from each frame
+    start: Tensor  # (B, 4) the start's pose from the first frame
+    memory: Tensor  # (B,) row of the behavior it was shown
+    right: Tensor  # (B,) whether that is the behavior it drives
+    valid: Tensor  # (B, S)
+    waypoint_m: Tensor  # (B, S, 2)
+    progress: Tensor  # (B, S)
+    on_route: Tensor  # (B, S)
+    levels: Tensor  # (D, 1) attractor quantisation
+
+    @classmethod
+    def build(
+        cls,
+        behaviors: Behaviors,
+        rollouts: Rollouts,
+        chosen: NDArray[np.intp],
+        rng: np.random.Generator,
+        device: torch.device,
+    ) -> "Minibatch":
+        """Repetitions `chosen` (B,) and the behaviors they were shown."""
+        shown, memory = np.unique(rollouts.shown[chosen], return_inverse=True)
+        longest = int(rollouts.frames[chosen].max())
+        poses = rollouts.poses[chosen, :longest]
+        valid = np.arange(longest) < rollouts.frames[chosen, None]
+        frame_poses = behaviors.frame_poses[shown]
+        first = behaviors.paths.poses[shown, 0]
+        share = np.linspace(0, behaviors.paths.poses.shape[1] - 1, SHAPE_POINTS + 1)[1:]
+        points = behaviors.paths.poses[shown][:, share.round().astype(int), :2]
+        shape = geometry.to_frame(first[:, None], points)  # (D, 8, 2)
+        goal = geometry.relative(poses, rollouts.goals[chosen][:, None])
+        start = geometry.relative(poses[:, 0], rollouts.starts[chosen])
+
+        def tensor(array: NDArray[np.generic]) -> Tensor:
+            wanted = array.astype(np.float32) if array.dtype == np.float64 else array
+            return torch.from_numpy(np.ascontiguousarray(wanted)).to(device)
+
+        return cls(
+            shown_images=tensor(behaviors.images[shown]),
+            shown_motion=tensor(_motion(frame_poses)),
+            shown_displacement=tensor(_vector(geometry.relative(frame_poses[:, :1], frame_poses))),
+            shape=tensor(shape.reshape(len(shown), -1)),
+            images=tensor(rollouts.images[chosen, :longest]),
+            motion=tensor(_motion(poses)),
+            displacement=tensor(_vector(geometry.relative(poses[:, :1], poses))),
+            goal=tensor(_vector(goal)),
+            start=tensor(_vector(start)),
+            memory=tensor(memory),
+            right=tensor(rollouts.shown[chosen] == rollouts.driven[chosen]),
+            valid=tensor(valid),
+            waypoint_m=tensor(rollouts.waypoint_m[chosen, :longest]),
+            progress=tensor(rollouts.progress[chosen, :longest]),
+            on_route=tensor(rollouts.on_route[chosen, :longest].astype(np.float32)),
+            levels=tensor(rng.choice(LEVELS, (len(shown), 1)).astype(np.float32)),
+        )
+
+
+def compute(
+    networks: BehaviorNetworks, heads: AuxiliaryHeads, batch: Minibatch, weights: LossWeights
+) -> tuple[Tensor, dict[str, float]]:
+    """Weighted loss and its parts."""
+    shown, steps = batch.shown_images.shape[:2]
+    count, longest = batch.images.shape[:2]
+    shown_motion, shown_ends, _ = _look(networks, batch.shown_images, whole=False)
+    motion, _, attractors = _look(networks, batch.images, whole=True)
+    shown_z, _ = networks.encoder(shown_motion)  # (D, T, 32)
+    z, _ = networks.encoder(motion)  # (B, S, 32)
+
+    goal_z = shown_z[:, -1]
+    # The memory is stored in few bits: half precision noise on z, coarse attractors.
+    goal_z = goal_z + 0.01 * torch.randn_like(goal_z)
+    ends = quantise(shown_ends.flatten(1), batch.levels).view(shown, 2, -1)
+    goal_z, ends = goal_z[batch.memory], ends[batch.memory]
+
+    relation = networks.generator.relation
+    goal_target = ends[:, 1:].expand(-1, longest, -1).flatten(0, 1)
+    goal_relation = relation(attractors.flatten(0, 1), goal_target).view(count, longest, -1)
+    start_relation = relation(attractors[:, 0], ends[:, 0])  # (B, relation)
+    out = networks.generator(
+        goal_relation,
+        start_relation[:, None].expand(-1, longest, -1),
+        z,
+        goal_z[:, None].expand(-1, longest, -1),
+    )
+
+    # Where the robot is lost there is no right waypoint.
+    driving = batch.valid & batch.right[:, None] & (batch.on_route > 0.5)
+    error = torch.linalg.vector_norm(out.waypoint_m - batch.waypoint_m, dim=-1)
+    near = _near(batch.goal) & batch.valid
+    pair = torch.ones_like(batch.shown_motion[..., 0], dtype=torch.bool)
+    parts = {
+        "waypoint": _mean(error, driving),
+        "progress": _mean((out.progress - batch.progress).abs(), driving),
+        "on_route": _mean(
+            F.binary_cross_entropy_with_logits(
+                out.on_route_logit, batch.on_route, reduction="none"
+            ),
+            batch.valid,
+        ),
+        "motion": 0.5
+        * (
+            _mean(_distance(heads.motion(motion), batch.motion * 5.0), batch.valid)
+            + _mean(_distance(heads.motion(shown_motion), batch.shown_motion * 5.0), pair)
+        ),
+        "displacement": 0.5
+        * (
+            _mean(_distance(heads.displacement(z), batch.displacement), batch.valid)
+            + _mean(_distance(heads.displacement(shown_z), batch.shown_displacement), pair)
+        ),
+        "shape": _distance(
+            heads.shape(shown_z[:, -1]).view(shown, SHAPE_POINTS, 2),
+            batch.shape.view(shown, SHAPE_POINTS, 2),
+        ).mean(),
+        "relation": _mean(_distance(heads.relation(goal_relation), batch.goal), near)
+        + _mean(_distance(heads.relation(start_relation), batch.start), _near(batch.start)),
+    }
+    total = torch.stack([getattr(weights, name) * part for name, part in parts.items()]).sum()
+    return total, {name: float(part.detach()) for name, part in parts.items()}
+
+
+def _look(networks: BehaviorNetworks, images: Tensor, *, whole: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """Motion (B, T, motion), attractors of the ends (B, 2, 400) and, if `whole`, of all frames."""
+    count, steps = images.shape[:2]
+    motions, ends, attractors = [], [], []
+    for some in images.split(max(1, CHUNK // steps)):
+        features = networks.trunk(some.flatten(0, 1))  # (b * T, 48, 16, 16)
+        motions.append(networks.encoder.pair.sequence(features, len(some)))
+        if whole:
+            attractors.append(networks.attractor(features))
+        else:
+            features = features.view(len(some), steps, *features.shape[1:])[:, [0, -1]]
+            ends.append(networks.attractor(features.flatten(0, 1)))
+    motion = torch.cat(motions).view(count, steps, -1)
+    if whole:
+        every = torch.cat(attractors).view(count, steps, -1)
+        return motion, every[:, [0, -1]], every
+    return motion, torch.cat(ends).view(count, 2, -1), motion
+
+
+def _motion(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pose of each frame in the one before, (B, T, 3); zero for the first."""
+    before = np.concatenate([poses[:, :1], poses[:, :-1]], axis=1)
+    return geometry.relative(before, poses)
+
+
+def _vector(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Poses (..., 3) as x, y, cos, sin (..., 4)."""
+    angle = pose[..., 2:]
+    return np.concatenate([pose[..., :2], np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def _near(pose: Tensor) -> Tensor:
+    """Whether views at relative poses (..., 4) overlap enough to be related."""
+    aligned = pose[..., 2] > float(np.cos(OVERLAP_RAD))
+    return (torch.linalg.vector_norm(pose[..., :2], dim=-1) < OVERLAP_M) & aligned
+
+
+def _distance(a: Tensor, b: Tensor) -> Tensor:
+    return torch.linalg.vector_norm(a - b, dim=-1)
+
+
+def _mean(value: Tensor, mask: Tensor) -> Tensor:
+    return (value * mask).sum() / mask.sum().clamp(min=1)

@@ -1,0 +1,204 @@
+"""The behavior networks: one trunk shared by encoder and attractor, and a waypoint generator.
+
+Paper, Sec. III-B and III-C, at about a sixth of the authors' parameters: a patch-like stem
+replaces their 5x5 convolutions, and every frame passes through it once.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from cbe import signature
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkConfig:
+    """Layer widths; the trunk's and the attractor's shapes are fixed by `cbe.signature`."""
+
+    pair_channels: tuple[int, int] = (64, 128)
+    motion: int = 192
+    encoder_state: int = 256
+    attractor_channels: int = 96
+    relation_channels: tuple[int, int] = (96, 160)
+    relation: int = 128
+    behavior: int = 128
+    generator_state: int = 320
+    head: int = 128
+
+
+State = tuple[Tensor, Tensor]  # h, c of an LSTM, each (1, B, size)
+
+
+class Generated(NamedTuple):
+    """The generator's outputs over a sequence."""
+
+    waypoint_m: Tensor  # (B, T, 2)
+    progress: Tensor  # (B, T)
+    on_route_logit: Tensor  # (B, T)
+    state: State
+
+
+class Trunk(nn.Module):
+    """Image to features: one 8x8 convolution of stride 4, as a patch stem."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stem = nn.Conv2d(3, signature.FEATURES[0], 8, stride=4, padding=2)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(N, 64, 64, 3) uint8 RGB to (N, 32, 16, 16)."""
+        x = image.permute(0, 3, 1, 2).float() / 255.0 - 0.5
+        return F.relu(self.stem(x))
+
+
+class Pair(nn.Module):
+    """Motion features of two consecutive frames.
+
+    The first convolution over both frames' channels is a sum of two, so each frame is convolved
+    once and serves as `now` and, a tick later, as `previous`.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        first, second = config.pair_channels
+        self.first = nn.Conv2d(signature.FEATURES[0], 2 * first, 3, stride=2, padding=1)
+        self.rest = nn.Sequential(
+            nn.ReLU(),
+            nn.Conv2d(first, second, 3, stride=2, padding=1),
+            nn.ReLU(),
+            nn.Flatten(),
+            nn.Linear(second * 16, config.motion),
+            nn.ReLU(),
+        )
+
+    def forward(self, features: Tensor, previous: Tensor) -> Tensor:
+        """Features (N, 32, 16, 16) of frames and of the frames before, to (N, motion)."""
+        now, _ = self.first(features).chunk(2, dim=1)
+        _, before = self.first(previous).chunk(2, dim=1)
+        return self.rest(now + before)
+
+    def sequence(self, features: Tensor, batch: int) -> Tensor:
+        """Features (B * T, 32, 16, 16) of whole sequences to (B * T, motion).
+
+        The first frame is its own predecessor, as in the paper's implementation.
+        """
+        both = self.first(features)
+        both = both.view(batch, -1, *both.shape[1:])  # (B, T, 2 * first, 8, 8)
+        now, before = both.chunk(2, dim=2)
+        before = torch.cat([before[:, :1], before[:, :-1]], dim=1)
+        return self.rest((now + before).flatten(0, 1))
+
+
+class Encoder(nn.Module):
+    """Motion features gathered by an LSTM into the embedding z (paper, Sec. III-B)."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.pair = Pair(config)
+        self.lstm = nn.LSTM(config.motion, config.encoder_state, batch_first=True)
+        self.to_embedding = nn.Linear(config.encoder_state, signature.EMBEDDING_SIZE)
+
+    def forward(self, motion: Tensor, state: State | None = None) -> tuple[Tensor, State]:
+        """Motion (B, T, motion) to embeddings (B, T, 32) and the LSTM's state."""
+        hidden, state = self.lstm(motion, state)
+        return self.to_embedding(hidden), state
+
+
+class Attractor(nn.Module):
+    """Features of one frame to 400 numbers in [0, 1], bounded so that they quantise evenly."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        width = config.attractor_channels
+        self.layers = nn.Sequential(
+            nn.Conv2d(signature.FEATURES[0], width, 3, stride=2, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(width, 16, 4),
+        )
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(N, 32, 16, 16) to (N, 400)."""
+        return torch.sigmoid(self.layers(features)).flatten(1)
+
+
+class Relation(nn.Module):
+    """Where one attractor's view lies relative to another's (paper: attractor pairs)."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        first, second = config.relation_channels
+        self.layers = nn.Sequential(
+            nn.Conv2d(48, first, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(first, second, 3),
+            nn.ReLU(),
+            nn.Flatten(),
+            nn.Linear(second * 9, config.relation),
+            nn.ReLU(),
+        )
+
+    def forward(self, now: Tensor, target: Tensor) -> Tensor:
+        """Attractors (N, 400) twice, to (N, relation)."""
+        now, target = now.view(-1, 16, 5, 5), target.view(-1, 16, 5, 5)
+        return self.layers(torch.cat([now, target, now - target], dim=1))
+
+
+class Generator(nn.Module):
+    """Waypoint, progress and on-route logit from attractors and embeddings (paper, Sec. III-C)."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.relation = Relation(config)
+        self.behavior = nn.Sequential(
+            nn.Linear(2 * signature.EMBEDDING_SIZE, 192),
+            nn.ReLU(),
+            nn.Linear(192, config.behavior),
+            nn.ReLU(),
+        )
+        inputs = 2 * config.relation + config.behavior
+        self.lstm = nn.LSTM(inputs, config.generator_state, batch_first=True)
+        self.head = nn.Sequential(
+            nn.Linear(config.generator_state + inputs, config.head), nn.ReLU()
+        )
+        self.out = nn.Linear(config.head, 4)
+
+    def forward(
+        self,
+        goal_relation: Tensor,
+        start_relation: Tensor,
+        embedding_now: Tensor,
+        embedding_goal: Tensor,
+        state: State | None = None,
+    ) -> Generated:
+        """Relations (B, T, relation), embeddings (B, T, 32); the goal's may be broadcast over T."""
+        behavior = self.behavior(torch.cat([embedding_now, embedding_goal], dim=-1))
+        inputs = torch.cat([goal_relation, start_relation, behavior], dim=-1)
+        hidden, state = self.lstm(inputs, state)
+        # The shortcut lets a reflex reach the waypoint without passing the recurrent state.
+        out = self.out(self.head(torch.cat([hidden, inputs], dim=-1)))  # (B, T, 4)
+        return Generated(out[..., :2], out[..., 2], out[..., 3], state)
+
+
+class BehaviorNetworks(nn.Module):
+    """Everything that is trained and exported; auxiliary heads live in `losses`."""
+
+    def __init__(self, config: NetworkConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or NetworkConfig()
+        self.trunk = Trunk()
+        self.encoder = Encoder(self.config)
+        self.attractor = Attractor(self.config)
+        self.generator = Generator(self.config)
+
+
+def quantise(attractor: Tensor, levels: Tensor) -> Tensor:
+    """Round (B, 400) in [0, 1] to `levels` (B, 1) steps, gradients passing straight through.
+
+    Rows whose level is 0 stay exact.
+    """
+    steps = levels.clamp(min=1)
+    rounded = torch.round(attractor * steps) / steps
+    return attractor + torch.where(levels > 0, rounded - attractor, 0.0).detach()
