@@ -10,16 +10,17 @@ that arc is not blindly the one to the waypoint: of a fan of arcs the one least 
 swept strip is clear is taken, which steers round what mere repulsion only brakes for.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cbe.arc import along_and_across, scan_points
+from cbe.arc import scan_points
+from cbe.manoeuvres import ManoeuvreGains, Manoeuvres
 from cbe.robot import STEP_S, Robot
 
 STANDSTILL_MPS = 0.02  # below it a yaw rate says nothing about the steering
-_POOL = 3  # rays to one point in the controller
+_POOL = 5  # rays to one point in the controller
 _ATTRACTED = 3  # of the control points
 _LEAST_STEERING_SPEED_MPS = 0.15  # keeps the steering's Jacobian regular from standstill
 
@@ -44,17 +45,12 @@ class RmpGains:
     repulsion_reach_m: float = 0.44
     nose_weight: float = 25.0
     corner_weight: float = 3.0
-    arcs: int = 21
-    arc_horizon_m: float = 0.8
-    wanted_clearance_m: float = 0.1  # between body and obstacle
-    least_clearance_m: float = 0.03
-    clearance_weight: float = 1.0
-    blocked_weight: float = 4.0
-    change_weight: float = 0.1
+    manoeuvres: ManoeuvreGains = field(default_factory=ManoeuvreGains)
     waypoint_speed_per_s: float = 3.0  # speed allowed per metre of distance to the waypoint
     arrived_m: float = 0.03
+    braking_mps2: float = 1.0
     tight_speed_mps: float = 0.2
-    braking_mps2: float = 0.5
+    open_clearance_m: float = 0.1
 
 
 def twist(motion: Motion, robot: Robot) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -94,8 +90,7 @@ class RmpController:
         weight[0] = gains.nose_weight
         weight[1:3] = gains.corner_weight
         self._repulsion_weight = weight * gains.repulsion_metric
-        widest = robot.max_curvature_per_m
-        self._fan = np.linspace(-widest, widest, gains.arcs)
+        self._manoeuvres = Manoeuvres(robot, gains.manoeuvres)
 
     def step(
         self,
@@ -134,59 +129,20 @@ class RmpController:
         waypoint: NDArray[np.float64],
         points: NDArray[np.float32],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Curvature (B,) nearest to the waypoint's whose strip is clear, and its speed (B,)."""
+        """Curvature (B,) to steer and the speed (B,) it allows."""
         gains, robot = self.gains, self.robot
-        widest = robot.max_curvature_per_m
         distance = np.hypot(waypoint[:, 0], waypoint[:, 1])
-        toward = _curvature_to(waypoint, distance, widest)
-        now = np.tan(motion.steer_rad) / robot.wheelbase_m
-        candidates = np.empty((len(toward), 1 + gains.arcs))  # (B, C)
-        candidates[:, 0], candidates[:, 1:] = toward, self._fan
-        horizon = _within(distance + robot.body_radius_m, 0.3, gains.arc_horizon_m)[:, None]
-        clearance, free = self._sweep(candidates, points, horizon)
-        short = np.maximum(1.0 - clearance / gains.wanted_clearance_m, 0.0)
-        blocked = np.maximum(1.0 - free / horizon, 0.0)
-        change = np.abs(candidates - toward[:, None])
-        change += gains.change_weight * np.abs(candidates - now[:, None])
-        cost = change / widest + gains.blocked_weight * blocked
-        cost += gains.clearance_weight * np.minimum(short, 1.5) ** 2
-        best = np.arange(len(cost)), cost.argmin(axis=1)
+        toward = _curvature_to(waypoint, distance, robot.max_curvature_per_m)
+        present = np.tan(motion.steer_rad) / robot.wheelbase_m
+        choice = self._manoeuvres.choose(toward, present, waypoint, points)
         speed = np.where(distance < gains.arrived_m, 0.0, gains.waypoint_speed_per_s * distance)
         # A near waypoint that has slipped behind the axle has been reached.
         speed = np.where((waypoint[:, 0] <= 0.0) & (distance < 0.15), 0.0, speed)
-        speed = np.minimum(speed, np.sqrt(2.0 * gains.braking_mps2 * free[best]))
-        openness = _within(clearance[best] / gains.wanted_clearance_m, 0.0, 1.0)
+        speed = np.minimum(speed, np.sqrt(2.0 * gains.braking_mps2 * choice.free_m))
+        openness = _within(choice.clearance_m / gains.open_clearance_m, 0.0, 1.0)
         tight = gains.tight_speed_mps
         speed = np.minimum(speed, tight + (robot.max_speed_mps - tight) * openness)
-        return candidates[best], np.minimum(speed, robot.max_speed_mps)
-
-    def _sweep(
-        self,
-        curvature: NDArray[np.float64],
-        points: NDArray[np.float32],
-        horizon: NDArray[np.float64],
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Body clearance (B, C) within `horizon` (B, 1) and free length (B, C) of arcs (B, C)."""
-        gains, radius = self.gains, self.robot.body_radius_m
-        reach = gains.arc_horizon_m + 2.0 * radius + gains.wanted_clearance_m
-        x, y = points[..., 0], points[..., 1]
-        near = (x > 0.0) & (x * x + y * y < reach**2)  # the rest cannot matter: saves most
-        near[:, 0] = True  # each robot keeps a point, as reduceat needs
-        row, _ = near.nonzero()
-        first = np.concatenate([[0], near.sum(axis=1).cumsum()[:-1]])
-        along, across = along_and_across(
-            points[near][:, None], curvature[row].astype(np.float32)
-        )  # (points near, C)
-        swept = (along > 0.03) & (along < horizon[row])
-        clearance = np.where(swept, across - radius, reach).astype(np.float32)
-        body = radius + gains.least_clearance_m
-        hit = (along > 0.0) & (across < body)
-        free = np.where(hit, along - np.sqrt(np.maximum(body**2 - across**2, 0.0)), reach)
-        free = np.maximum(free, 0.0).astype(np.float32)
-        return (
-            np.minimum.reduceat(clearance, first, axis=0),
-            np.minimum.reduceat(free, first, axis=0),
-        )
+        return choice.curvature_per_m, np.minimum(speed, robot.max_speed_mps)
 
     def _resolve(
         self,
@@ -223,18 +179,19 @@ class RmpController:
         away = away / gap_m[..., None]
         x, y = repelled[:, 0], repelled[:, 1]
         across = away[..., 1] * x - away[..., 0] * y  # (B, 9)
-        by_speed = away[..., 0] + present[:, None] * across
-        by_steer = gain[:, None] * across
+        rows = np.empty((3, *gap_m.shape))  # Jacobian row and wished acceleration along `away`
+        by_speed, by_steer, push = rows
+        by_speed[:] = away[..., 0] + present[:, None] * across
+        by_steer[:] = gain[:, None] * across
         approach = np.minimum(speed[:, None] * by_speed, 0.0)
-        push = gains.repulsion_mps2 - gains.repulsion_damping_per_s * approach
+        push[:] = gains.repulsion_mps2 - gains.repulsion_damping_per_s * approach
         metric = self._repulsion_weight * np.exp(
             -gains.repulsion_decay_per_m * (gap_m - gains.repulsion_reach_m)
         )
-        m11 = m11 + (metric * by_speed**2).sum(axis=1)
-        m12 = m12 + (metric * by_speed * by_steer).sum(axis=1)
-        m22 = m22 + (metric * by_steer**2).sum(axis=1)
-        r1 = r1 + (metric * by_speed * push).sum(axis=1)
-        r2 = r2 + (metric * by_steer * push).sum(axis=1)
+        rows = rows.swapaxes(0, 1)  # (B, 3, 9)
+        sums = (rows * metric[:, None]) @ rows.swapaxes(1, 2)  # (B, 3, 3)
+        m11, m12, m22 = m11 + sums[:, 0, 0], m12 + sums[:, 0, 1], m22 + sums[:, 1, 1]
+        r1, r2 = r1 + sums[:, 0, 2], r2 + sums[:, 1, 2]
         # Pseudo-inverse of the 2 x 2 normal equations; the attracted points keep it regular.
         determinant = m11 * m22 - m12**2
         return (m22 * r1 - m12 * r2) / determinant, (m11 * r2 - m12 * r1) / determinant

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar, Self
@@ -11,8 +10,8 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from cbe import definitions
 from cbe.camera import CameraModel
+from cbe.codec import Message, new, schema, type_hash
 from cbe.errors import MessageError
 
 NANOSECONDS = 1_000_000_000
@@ -22,41 +21,6 @@ Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
-
-
-class Message(ABC):
-    """Base of all messages. Arrays decoded from a buffer are read-only views of it."""
-
-    __slots__ = ()
-    TYPE: ClassVar[str]
-
-    def to_cdr(self) -> bytes:
-        """Little-endian CDR with its header; raises MessageError where a value does not fit."""
-        try:
-            return bytes(
-                definitions.typestore().serialize_cdr(self._to_ros(), self.TYPE, little_endian=True)
-            )
-        except (*_codec_errors(), AttributeError, TypeError, UnicodeEncodeError) as error:
-            raise MessageError(f"cannot write this {self.TYPE}: {error}") from error
-
-    @classmethod
-    def from_cdr(cls, data: bytes | memoryview) -> Self:
-        """Decode; raises MessageError for truncated or malformed bytes."""
-        try:
-            return cls._from_ros(definitions.typestore().deserialize_cdr(data, cls.TYPE))
-        except _codec_errors() as error:
-            raise MessageError(
-                f"{len(data)} bytes are no {cls.TYPE}: {error}; check the sender's message type"
-            ) from error
-
-    @abstractmethod
-    def _to_ros(self) -> object:
-        """The codec's object of this message."""
-
-    @classmethod
-    @abstractmethod
-    def _from_ros(cls, ros: Any) -> Self:
-        """Inverse of `_to_ros`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +35,7 @@ class CompressedImage(Message):
     data: Bytes
 
     def _to_ros(self) -> object:
-        return _new(self.TYPE, _header(self.stamp_ns, self.frame_id), self.format, self.data)
+        return new(self.TYPE, _header(self.stamp_ns, self.frame_id), self.format, self.data)
 
     @classmethod
     def _from_ros(cls, ros: Any) -> Self:
@@ -94,7 +58,7 @@ class Image(Message):
 
     def _to_ros(self) -> object:
         header = _header(self.stamp_ns, self.frame_id)
-        return _new(
+        return new(
             self.TYPE, header, self.height, self.width, self.encoding, 0, self.step, self.data
         )
 
@@ -147,7 +111,7 @@ class CameraInfo(Message):
         k = np.array(self.matrix, np.float64)
         projection = np.zeros((3, 4))
         projection[:, :3] = k.reshape(3, 3)  # (9,) to (3, 3)
-        return _new(
+        return new(
             self.TYPE,
             _header(self.stamp_ns, self.frame_id),
             self.height,
@@ -159,7 +123,7 @@ class CameraInfo(Message):
             projection.reshape(12),
             0,
             0,
-            _new("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False),
+            new("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False),
         )
 
     @classmethod
@@ -198,7 +162,7 @@ class LaserScan(Message):
     intensities: Floats = field(default_factory=lambda: np.empty(0, np.float32))
 
     def _to_ros(self) -> object:
-        return _new(
+        return new(
             self.TYPE,
             _header(self.stamp_ns, self.frame_id),
             self.angle_min_rad,
@@ -259,8 +223,8 @@ class Twist(Message):
         return self.angular_rad_s[2]
 
     def _to_ros(self) -> object:
-        linear = _new("geometry_msgs/msg/Vector3", *self.linear_mps)
-        return _new(self.TYPE, linear, _new("geometry_msgs/msg/Vector3", *self.angular_rad_s))
+        linear = new("geometry_msgs/msg/Vector3", *self.linear_mps)
+        return new(self.TYPE, linear, new("geometry_msgs/msg/Vector3", *self.angular_rad_s))
 
     @classmethod
     def _from_ros(cls, ros: Any) -> Self:
@@ -278,7 +242,7 @@ class TwistStamped(Message):
     twist: Twist
 
     def _to_ros(self) -> object:
-        return _new(self.TYPE, _header(self.stamp_ns, self.frame_id), self.twist._to_ros())
+        return new(self.TYPE, _header(self.stamp_ns, self.frame_id), self.twist._to_ros())
 
     @classmethod
     def _from_ros(cls, ros: Any) -> Self:
@@ -317,17 +281,17 @@ class Odometry(Message):
         return self.position_m[0], self.position_m[1], yaw
 
     def _to_ros(self) -> object:
-        pose = _new(
+        pose = new(
             "geometry_msgs/msg/Pose",
-            _new("geometry_msgs/msg/Point", *self.position_m),
-            _new("geometry_msgs/msg/Quaternion", *self.orientation_xyzw),
+            new("geometry_msgs/msg/Point", *self.position_m),
+            new("geometry_msgs/msg/Quaternion", *self.orientation_xyzw),
         )
-        return _new(
+        return new(
             self.TYPE,
             _header(self.stamp_ns, self.frame_id),
             self.child_frame_id,
-            _new("geometry_msgs/msg/PoseWithCovariance", pose, np.zeros(36)),
-            _new("geometry_msgs/msg/TwistWithCovariance", self.twist._to_ros(), np.zeros(36)),
+            new("geometry_msgs/msg/PoseWithCovariance", pose, np.zeros(36)),
+            new("geometry_msgs/msg/TwistWithCovariance", self.twist._to_ros(), np.zeros(36)),
         )
 
     @classmethod
@@ -353,12 +317,12 @@ class MessageType:
     @cached_property
     def definition(self) -> str:
         """Schema text in MCAP's `ros2msg` encoding, with all the types it refers to."""
-        return definitions.schema(self.name)
+        return schema(self.name)
 
     @cached_property
     def type_hash(self) -> str:
         """`RIHS01_...`."""
-        return definitions.type_hash(self.name)
+        return type_hash(self.name)
 
 
 MESSAGE_TYPES = {
@@ -367,23 +331,9 @@ MESSAGE_TYPES = {
 }
 
 
-def _codec_errors() -> tuple[type[Exception], ...]:
-    """What the codec raises on values and bytes that do not fit."""
-    import struct
-
-    from rosbags.serde import SerdeError
-
-    return SerdeError, struct.error, ValueError, IndexError, OverflowError
-
-
-def _new(name: str, *values: object) -> object:
-    """The codec's object of a type, from all its fields in order."""
-    return definitions.typestore().types[name](*values)
-
-
 def _header(stamp_ns: int, frame_id: str) -> object:
-    time = _new("builtin_interfaces/msg/Time", *divmod(stamp_ns, NANOSECONDS))
-    return _new("std_msgs/msg/Header", time, frame_id)
+    time = new("builtin_interfaces/msg/Time", *divmod(stamp_ns, NANOSECONDS))
+    return new("std_msgs/msg/Header", time, frame_id)
 
 
 def _stamp_ns(header: Any) -> int:

@@ -52,7 +52,9 @@ def _trim(rng: Rng, wall: Floats) -> Floats:
 def plaster(rng: Rng) -> Floats:
     """Nearly plain paint, often white."""
     white = rng.random() < 0.45
-    base = colour(rng, (0.0, 0.05), (0.82, 0.95)) if white else colour(rng, (0.08, 0.5), (0.5, 0.92))
+    base = (
+        colour(rng, (0.0, 0.05), (0.82, 0.95)) if white else colour(rng, (0.08, 0.5), (0.5, 0.92))
+    )
     wall = modulate(fill(base), noise(rng, 2.0), rng.uniform(0.004, 0.03))
     return _trim(rng, modulate(wall, noise(rng, 0.3), rng.uniform(0.0, 0.02)))
 
@@ -221,7 +223,9 @@ def panel_ceiling(rng: Rng) -> Floats:
     """Suspended panels or wooden boards; some panels are lights or vents."""
     if rng.random() < 0.25:
         joints, unit = courses(1, int(rng.choice([8, 12])), 0.0, 0.08)
-        boards = modulate(grain(rng, wood_colour(rng, (0.5, 0.9)), 0.06), per_unit(rng, unit, 0.05), 1)
+        boards = modulate(
+            grain(rng, wood_colour(rng, (0.5, 0.9)), 0.06), per_unit(rng, unit, 0.05), 1
+        )
         boards[joints] *= 0.7
         return boards
     joints, unit = courses(4, 4, 0.0, 0.05)
@@ -237,7 +241,9 @@ def lamp(rng: Rng) -> Floats:
     """Ceiling light with a rim and slats."""
     light = fill(colour(rng, (0.0, 0.12), (0.97, 1.0)))
     slats = ((X * int(rng.integers(2, 9))) % 1.0 < 0.12).astype(np.float32)
-    return frame(modulate(light, slats, -0.25), int(rng.integers(4, 10)), np.full(3, 170, np.float32))
+    return frame(
+        modulate(light, slats, -0.25), int(rng.integers(4, 10)), np.full(3, 170, np.float32)
+    )
 
 
 def rug(rng: Rng) -> Floats:

@@ -71,7 +71,7 @@ def bedding(rng: Rng) -> Floats:
     blanket = fabric(rng)
     sheet = colour(rng, (0.0, 0.15), (0.8, 0.96))
     blanket[:40] = sheet
-    for left in ((8, 68) if rng.random() < 0.7 else (28,)):
+    for left in (8, 68) if rng.random() < 0.7 else (28,):
         cv2.rectangle(blanket, (left, 6), (left + 52, 32), _tone(rng, (0.0, 0.6)), -1)
         cv2.rectangle(blanket, (left, 6), (left + 52, 32), (150.0, 150.0, 150.0), 1)
     blanket[40:44] *= 0.8
@@ -176,7 +176,7 @@ def window(rng: Rng) -> Floats:
     if cover < 0.4:
         cloth = modulate(fabric(rng), np.sin(X * 150.0), 0.14)
         width = rng.uniform(0.12, 0.3)
-        closed = (X < width) | (X > 1.0 - width)
+        closed = np.abs(X - 0.5) > 0.5 - width
         image[closed] = cloth[closed]
     elif cover < 0.6:
         slats = fill(colour(rng, (0.0, 0.3), (0.6, 0.95)))
@@ -270,7 +270,9 @@ def box(rng: Rng) -> Floats:
 
 def appliance(rng: Rng) -> Floats:
     """Oven, washer, fridge or server: a box with a porthole, panes and a control strip."""
-    image = modulate(fill(colour(rng, (0.0, 0.15), (0.2, 0.95))), noise(rng, 0.6, along_y=0.05), 0.03)
+    image = modulate(
+        fill(colour(rng, (0.0, 0.15), (0.2, 0.95))), noise(rng, 0.6, along_y=0.05), 0.03
+    )
     kind = int(rng.integers(4))
     if kind == 0:
         cv2.circle(image, (64, 74), int(rng.integers(28, 44)), (190.0, 190.0, 195.0), -1)
@@ -297,7 +299,9 @@ def screen(rng: Rng) -> Floats:
     if rng.random() < 0.6:
         image = _shapes(rng) if rng.random() < 0.5 else _poster(rng)
     else:
-        image = mix(image, np.full(3, 90, np.float32), 0.8 - 3 * np.abs(X - Y - rng.uniform(-0.5, 0.5)))
+        image = mix(
+            image, np.full(3, 90, np.float32), 0.8 - 3 * np.abs(X - Y - rng.uniform(-0.5, 0.5))
+        )
     return frame(np.ascontiguousarray(image, np.float32), 5, np.full(3, 22, np.float32))
 
 

@@ -1,400 +1,228 @@
-"""Generated worlds: houses, apartments and offices with doors, furniture, pictures and windows."""
+"""Generated worlds: furnished houses, apartments and offices from a seed."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
-from cbe_hil_sim import textures
-from cbe_hil_sim.world import RESOLUTION_M, Surfaces, World
+from cbe.errors import WorldError
+from cbe_hil_sim.layout import Layout, Opening, Rect, draw_layout, to_cells
+from cbe_hil_sim.placing import Footprint, Placer
+from cbe_hil_sim.surfacing import Look, SurfaceTable, Tint, draw_looks, pick
+from cbe_hil_sim.textures import bank
+from cbe_hil_sim.world import RESOLUTION_M, World
 
 TRAIN_SEEDS = range(100_000)
 VALIDATION_SEEDS = range(100_000, 110_000)
 TEST_SEEDS = range(200_000, 210_000)
+SPLIT_SEEDS = {"train": TRAIN_SEEDS, "validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
 
-Rect = tuple[int, int, int, int]  # row, column, rows, columns in cells
-_BORDER = 4  # cells of the outer wall
-_PASSABLE_M = 0.3
+Rng = np.random.Generator
+Heights = NDArray[np.float32]
+Rows = NDArray[np.uint16]
 
 
 def split_of(seed: int) -> str:
-    """Texture split of a seed."""
-    return "train" if seed < 100_000 else "validation" if seed < 200_000 else "test"
+    """Return the split a seed belongs to, and so its texture bank.
+
+    Raises:
+        WorldError: the seed is in none of the ranges.
+    """
+    for split, seeds in SPLIT_SEEDS.items():
+        if seed in seeds:
+            return split
+    ranges = ", ".join(f"{k} {v.start}..{v.stop - 1}" for k, v in SPLIT_SEEDS.items())
+    raise WorldError(f"world seed {seed} is in no split; use one of: {ranges}")
 
 
 def generate(seed: int) -> World:
-    """Build the world of `seed`, the same on any machine; its split decides its textures."""
-    return _Builder(seed).build()
+    """Build the world of `seed`, the same one each time; all its floor is reachable.
+
+    Every floor cell with at least 0.3 m of clearance can be reached from every other.
+
+    Raises:
+        WorldError: the seed is in none of the splits' ranges.
+    """
+    split = split_of(seed)
+    rng = np.random.default_rng([seed, 7])
+    layout = draw_layout(rng)
+    builder = Builder(layout, rng, round(float(rng.uniform(2.3, 3.2)), 2))
+    builder.build()
+    return builder.finish(bank(split), f"{layout.style}-{seed}")
 
 
 @dataclass(slots=True)
-class _Item:
-    """A piece of furniture: its footprint and what it was before, to take it back."""
+class Builder:
+    """Paints a layout, its furniture and what hangs on its walls into a world's grids."""
 
-    rect: Rect
-    room: int
+    layout: Layout
+    rng: Rng
+    ceiling_m: float
+    table: SurfaceTable = field(init=False, default_factory=SurfaceTable)
+    looks: list[Look] = field(init=False)
+    solid_top: Heights = field(init=False)
+    span_bottom: Heights = field(init=False)
+    span_top: Heights = field(init=False)
+    side: Rows = field(init=False)
+    cap: Rows = field(init=False)
+    span: Rows = field(init=False)
+    floor: Rows = field(init=False)
+    ceiling: Rows = field(init=False)
 
+    def __post_init__(self) -> None:
+        """Start from solid wall everywhere."""
+        shape = self.layout.shape
+        self.solid_top = np.full(shape, self.ceiling_m, np.float32)
+        self.span_bottom, self.span_top = np.zeros((2, *shape), np.float32)
+        self.side, self.cap, self.span, self.floor, self.ceiling = np.zeros((5, *shape), np.uint16)
+        kinds = [room.kind for room in self.layout.rooms]
+        self.looks = draw_looks(self.rng, kinds, self.layout.style)
+        self.table.add(pick(self.rng, "plaster"), (3.0, self.ceiling_m), np.full(3, 0.9))
 
-class _Builder:
-    def __init__(self, seed: int) -> None:
-        self.seed = seed
-        self.rng = np.random.default_rng([seed, 0])
-        rng = self.rng
-        area = rng.uniform(100.0, 420.0)
-        aspect = rng.uniform(0.6, 1.6)
-        self.rows = int(np.sqrt(area * aspect) / RESOLUTION_M)
-        self.columns = int(np.sqrt(area / aspect) / RESOLUTION_M)
-        self.ceiling = float(rng.uniform(2.3, 3.2))
-        self.office = bool(rng.random() < 0.35)
-        self.bank = textures.bank(split_of(seed))
-        shape = (self.rows, self.columns)
-        self.solid = np.full(shape, self.ceiling, np.float32)
-        self.span_bottom = np.zeros(shape, np.float32)
-        self.span_top = np.zeros(shape, np.float32)
-        self.side, self.cap, self.span, self.floor, self.roof = np.zeros((5, *shape), np.uint16)
-        self.taken = np.ones(shape, np.bool_)
-        self.room_of = np.full(shape, -1)
-        self.texture: list[int] = []
-        self.origin: list[tuple[float, float, float]] = []
-        self.size: list[tuple[float, float]] = []
-        self.tint: list[NDArray[np.floating]] = []
+    def build(self) -> None:
+        """Paint rooms, openings, furniture, lights and pictures, in this order."""
+        for index in range(len(self.layout.rooms)):
+            self._paint_room(index)
+        framed = bool(self.rng.random() < 0.75)
+        frame = pick(self.rng, "wood", "lacquer", "plain_ceiling")
+        for opening in self.layout.openings:
+            self._cut(opening, frame if framed else None)
+        for placed in Placer(self.layout, self.rng).furnish():
+            shade = self.rng.uniform(0.85, 1.15) * self.looks[placed.room].tint
+            for footprint in placed.footprints:
+                self._stand(footprint, shade)
+        for index in range(len(self.layout.rooms)):
+            self._light_room(index)
+            self._hang_pictures(index)
 
-    # --- surfaces -------------------------------------------------------------------------
-
-    def surface(
-        self,
-        families: tuple[str, ...],
-        tint: NDArray[np.floating],
-        size: tuple[float, float],
-        origin: tuple[float, float, float] | None = None,
-    ) -> int:
-        """Add a surface with a random texture of one of the families."""
-        family = families[int(self.rng.integers(len(families)))]
-        options = textures.FAMILIES[family]
-        self.texture.append(options[int(self.rng.integers(len(options)))])
-        offset = self.rng.uniform(0.0, 5.0, 2)
-        self.origin.append(origin if origin else (float(offset[0]), float(offset[1]), 0.0))
-        self.size.append(size)
-        self.tint.append(tint)
-        return len(self.texture) - 1
-
-    # --- rooms ----------------------------------------------------------------------------
-
-    def split(self, rect: Rect, rooms: list[Rect]) -> None:
-        """Cut a rectangle into rooms, leaving walls between them."""
-        rng = self.rng
-        row, column, rows, columns = rect
-        wall = int(rng.integers(2, 5))
-        small = 55 if not self.office else 50  # cells: 2.5 m
-        longest = max(rows, columns)
-        area = rows * columns * RESOLUTION_M**2
-        if longest < 2 * small + wall or (area < rng.uniform(12.0, 40.0)):
-            rooms.append(rect)
-            return
-        along_rows = rows >= columns if rng.random() < 0.85 else rows < columns
-        length = rows if along_rows else columns
-        if length < 2 * small + wall:
-            along_rows, length = not along_rows, columns if along_rows else rows
-        if area > 90.0 and rng.random() < (0.8 if self.office else 0.4):
-            width = int(rng.integers(24, 40))  # a corridor of 1.2 to 2 m
-            at = int(rng.integers(small, max(small + 1, length - small - width - 2 * wall)))
-            cuts = [(0, at), (at + wall, width), (at + 2 * wall + width, length - at - 2 * wall - width)]
-        else:
-            at = int(rng.integers(small, length - small - wall + 1))
-            cuts = [(0, at), (at + wall, length - at - wall)]
-        for index, (begin, size) in enumerate(cuts):
-            if size < 20:
-                continue
-            part = (
-                (row + begin, column, size, columns)
-                if along_rows
-                else (row, column + begin, rows, size)
-            )
-            if len(cuts) == 3 and index == 1:
-                rooms.append(part)
-            else:
-                self.split(part, rooms)
-
-    def paint_rooms(self, rooms: list[Rect]) -> None:
-        """Floors, ceilings and wallpaper; some rooms share theirs."""
-        rng = self.rng
-        gains = np.exp(rng.normal(0.0, 0.22, len(rooms)))
-        shared: list[tuple[tuple[str, ...], float]] = []
-        plain = rng.random() < 0.35
-        self.light = []
-        wall_of = np.zeros(len(rooms), np.uint16)
-        floor_style = (("wood_floor",), ("tile_floor", "checker"), ("carpet",), ("parquet", "marble"))
-        common_floor = floor_style[int(rng.integers(4))]
-        for index, (row, column, rows, columns) in enumerate(rooms):
-            light = gains[index] * np.exp(rng.normal(0.0, 0.05, 3))
-            self.light.append(light)
-            style: tuple[str, ...] = ("plaster",) if plain else ("plaster", "wallpaper", "wallpaper", "mural")
-            if not plain and rng.random() < 0.2:
-                style = ("brick", "panelling", "tiled_wall")
-            wide = float(rng.uniform(2.0, 5.0))
-            if shared and rng.random() < 0.35:
-                self.texture.append(self.texture[shared[-1][0]])  # type: ignore[index]
-                self.origin.append(self.origin[shared[-1][0]])  # type: ignore[index]
-                self.size.append(self.size[shared[-1][0]])  # type: ignore[index]
-                self.tint.append(light)
-                wall = len(self.texture) - 1
-            else:
-                wall = self.surface(style, light, (wide, self.ceiling))
-                shared.append((wall, wide))  # type: ignore[arg-type]
-            wall_of[index] = wall
-            floor_family = common_floor if rng.random() < 0.5 else floor_style[int(rng.integers(4))]
-            repeat = float(rng.uniform(1.0, 3.0))
-            floor = self.surface(floor_family, light, (repeat, repeat))
-            repeat = float(rng.uniform(1.2, 3.0))
-            roof = self.surface(("plain_ceiling", "panel_ceiling"), light, (repeat, repeat))
-            area = np.s_[row : row + rows, column : column + columns]
-            self.solid[area] = 0.0
-            self.taken[area] = False
-            self.floor[area], self.roof[area] = floor, roof
-            self.room_of[area] = index
-        nearest = ndimage.distance_transform_edt(
-            self.room_of < 0, return_distances=False, return_indices=True
-        )
-        self.nearest = self.room_of[tuple(nearest)]
-        self.side[:] = self.cap[:] = self.span[:] = wall_of[self.nearest]
-        self.wall_of = wall_of
-        for grid in (self.floor, self.roof):
-            grid[:] = grid[tuple(nearest)]
-
-    def cut_doors(self, rooms: list[Rect]) -> None:
-        """Connect neighbouring rooms: a spanning tree of doors and some more."""
-        rng = self.rng
-        edges = []
-        for a, (ra, ca, ha, wa) in enumerate(rooms):
-            for b, (rb, cb, hb, wb) in enumerate(rooms):
-                for gap, low, high, vertical in (
-                    (cb - (ca + wa), max(ra, rb), min(ra + ha, rb + hb), True),
-                    (rb - (ra + ha), max(ca, cb), min(ca + wa, cb + wb), False),
-                ):
-                    if 0 < gap <= 6 and high - low >= 26:
-                        edges.append((a, b, gap, low, high, vertical))
-        group = list(range(len(rooms)))
-        for k in rng.permutation(len(edges)):
-            a, b, gap, low, high, vertical = edges[k]
-            joined = group[a] == group[b]
-            if joined and rng.random() > 0.25:
-                continue
-            if not joined:
-                old, new = group[a], group[b]
-                group = [new if g == old else g for g in group]
-            opening = rng.random() < 0.2 and high - low > 44
-            width = int(rng.integers(26, min(50, high - low - 8))) if opening else int(rng.integers(17, 21))
-            at = int(rng.integers(low + 3, high - width - 2))
-            start = (rooms[a][1] + rooms[a][3]) if vertical else (rooms[a][0] + rooms[a][2])
-            area = (
-                np.s_[at : at + width, start : start + gap]
-                if vertical
-                else np.s_[start : start + gap, at : at + width]
-            )
-            self.solid[area] = 0.0
-            if not (opening and rng.random() < 0.4):
-                self.span_bottom[area] = min(float(rng.uniform(2.0, 2.12)), self.ceiling - 0.1)
-                self.span_top[area] = self.ceiling
-            margin = 20  # a metre before doors stays free
-            r, c = area
-            self.taken[
-                max(0, r.start - margin * (not vertical) - 3) : r.stop + margin * (not vertical) + 3,
-                max(0, c.start - margin * vertical - 3) : c.stop + margin * vertical + 3,
-            ] = True
-            if not opening and rng.random() < 0.35:
-                self.hang_leaf(area, vertical)
-
-    def hang_leaf(self, area: tuple[slice, slice], vertical: bool) -> None:
-        """Add an open door leaf: a thin slab beside the doorway, at right angles to the wall."""
-        r, c = area
-        depth = int(self.rng.integers(14, 18))
-        sign = int(self.rng.integers(2))
-        end = int(self.rng.integers(2))
-        if vertical:
-            line = r.start - 1 if end == 0 else r.stop
-            first = c.stop if sign else c.start - depth
-            place = np.s_[line : line + 1, max(first, 0) : first + depth]
-        else:
-            line = c.start - 1 if end == 0 else c.stop
-            first = r.stop if sign else r.start - depth
-            place = np.s_[max(first, 0) : first + depth, line : line + 1]
-        if self.solid[place].size == 0 or self.solid[place].max() > 0:
-            return
-        light = self.light[self.nearest[place].flat[0]]
-        y0, x0 = place[0].start * RESOLUTION_M, place[1].start * RESOLUTION_M
-        door = self.surface(("door",), light, (depth * RESOLUTION_M, 2.0), (x0, y0, 0.0))
-        self.solid[place] = 2.0
-        self.side[place] = self.cap[place] = door
-
-    # --- furniture ------------------------------------------------------------------------
-
-    def furnish(self, index: int, room: Rect) -> None:
-        """Stand furniture along the walls and, in larger rooms, free."""
-        rng = self.rng
-        row, column, rows, columns = room
-        area = rows * columns * RESOLUTION_M**2
-        if min(rows, columns) < 42:  # a corridor keeps to a few slim things
-            for _ in range(int(rng.integers(0, 4))):
-                self.place(index, room, (int(rng.integers(6, 24)), int(rng.integers(4, 7))), wall=True)
-            return
-        for _ in range(int(rng.poisson(2.0 + area / 4.5))):
-            self.place(index, room, (int(rng.integers(8, 44)), int(rng.integers(7, 20))), wall=True)
-        for _ in range(int(rng.poisson(area / 14.0))):
-            self.place(index, room, (int(rng.integers(8, 36)), int(rng.integers(8, 26))), wall=False)
-        if rng.random() < 0.5:  # a rug
-            h, w = int(rng.integers(20, max(21, rows - 10))), int(rng.integers(20, max(21, columns - 10)))
-            r = row + int(rng.integers(0, max(1, rows - h)))
-            c = column + int(rng.integers(0, max(1, columns - w)))
-            h, w = min(h, rows), min(w, columns)
-            size = (w * RESOLUTION_M, h * RESOLUTION_M)
-            rug = self.surface(("rug",), self.light[index], size, (c * RESOLUTION_M, r * RESOLUTION_M, 0.0))
-            self.floor[r : r + h, c : c + w] = rug
-
-    def place(self, index: int, room: Rect, size: tuple[int, int], *, wall: bool) -> None:
-        """Try a few places for one piece of `size` (width, depth) cells."""
-        rng = self.rng
-        row, column, rows, columns = room
-        for _ in range(6):
-            edge = int(rng.integers(4))
-            h, w = (size[1], size[0]) if edge < 2 else (size[0], size[1])
-            if h > rows - 4 or w > columns - 4:
-                return
-            r, c = row + int(rng.integers(0, rows - h + 1)), column + int(rng.integers(0, columns - w + 1))
-            if wall:
-                r = (row, row + rows - h, r, r)[edge]
-                c = (c, c, column, column + columns - w)[edge]
-            elif min(r - row, c - column, row + rows - r - h, column + columns - c - w) < 16:
-                continue
-            if self.taken[r : r + h, c : c + w].any():
-                continue
-            self.stand(index, (r, c, h, w), wall=wall)
-            around = 14 if not wall else 6  # room to pass between pieces
-            self.taken[max(r - around, 0) : r + h + around, max(c - around, 0) : c + w + around] = True
-            return
-
-    def stand(self, index: int, rect: Rect, *, wall: bool) -> None:
-        """Fill a footprint with a random kind of furniture."""
-        rng = self.rng
-        r, c, h, w = rect
-        area = np.s_[r : r + h, c : c + w]
-        light = self.light[index] * rng.uniform(0.85, 1.1)
-        origin = (c * RESOLUTION_M, r * RESOLUTION_M, 0.0)
-        wide = max(h, w) * RESOLUTION_M
-        flat = (w * RESOLUTION_M, h * RESOLUTION_M)
-        kind = rng.random()
-        small = max(h, w) < 14
-        if kind < 0.3 and not small:  # table or desk: a top on legs
-            top = float(rng.uniform(0.45, 0.8))
-            board = self.surface(("wood", "lacquer"), light, flat, origin)
-            leg = self.surface(("wood", "lacquer"), light, (wide, top), origin)
-            self.span_bottom[area], self.span_top[area] = top - 0.05, top
-            self.span[area] = board
-            for y in (r, r + h - 1):
-                for x in (c, c + w - 1):
-                    self.solid[y, x] = top - 0.05
-                    self.side[y, x] = self.cap[y, x] = leg
-            if rng.random() < 0.5:  # a drawer block or something on it
-                part = np.s_[r : r + h, c : c + max(2, w // 4)]
-                self.solid[part] = top - 0.05
-                self.side[part] = self.cap[part] = leg
-            return
-        if wall and kind < 0.62:
-            height = float(rng.choice([rng.uniform(0.4, 0.9), rng.uniform(0.9, 1.5), rng.uniform(1.6, 2.2)]))
-            families: tuple[str, ...] = ("cabinet", "cabinet", "bookshelf", "appliance", "wood")
-            if height < 1.0:
-                families = ("cabinet", "lacquer", "wood", "appliance", "screen")
-        elif kind < 0.75:  # sofa or bed: soft, low
-            height, families = float(rng.uniform(0.35, 0.6)), ("fabric", "bedding")
-        elif kind < 0.85 and small:
-            height, families = float(rng.uniform(0.5, 1.6)), ("foliage",)
-        else:
-            height, families = float(rng.uniform(0.2, 1.0)), ("box", "fabric", "lacquer", "wood", "photo")
-        height = min(height, self.ceiling - 0.05)
-        side = self.surface(families, light, (wide, height), origin)
-        top_families = families if families == ("fabric", "bedding") else ("wood", "lacquer")
-        cap = self.surface(top_families, light, flat, origin)
-        self.solid[area] = height
-        self.side[area], self.cap[area] = side, cap
-        if families == ("fabric", "bedding") and rng.random() < 0.7:  # a back rest
-            back = np.s_[r : r + h, c : c + 3] if h > w else np.s_[r : r + 3, c : c + w]
-            self.solid[back] = height + float(rng.uniform(0.25, 0.5))
-
-    def hang(self, index: int, room: Rect) -> None:
-        """Pictures, windows, screens and shelves on a room's walls, one cell deep."""
-        rng = self.rng
-        row, column, rows, columns = room
-        spots = int(rng.poisson(0.35 * (rows + columns) * 2 * RESOLUTION_M / (4.0 if self.office else 2.2)))
-        for _ in range(spots):
-            edge, width = int(rng.integers(4)), int(rng.integers(7, 32))
-            length = columns if edge < 2 else rows
-            if width > length - 6:
-                continue
-            at = int(rng.integers(3, length - width - 2))
-            if edge < 2:
-                r = row if edge == 0 else row + rows - 1
-                area = np.s_[r : r + 1, column + at : column + at + width]
-                behind = np.s_[r - 1 : r, area[1]] if edge == 0 else np.s_[r + 1 : r + 2, area[1]]
-            else:
-                c = column if edge == 2 else column + columns - 1
-                area = np.s_[row + at : row + at + width, c : c + 1]
-                behind = np.s_[area[0], c - 1 : c] if edge == 2 else np.s_[area[0], c + 1 : c + 2]
-            if self.solid[behind].min() < self.ceiling or self.span_top[area].max() > 0:
-                continue
-            bottom = float(rng.uniform(1.12, 1.5))
-            bottom = max(bottom, float(self.solid[area].max()) + 0.05)
-            top = min(bottom + float(rng.uniform(0.35, 1.1)), self.ceiling - 0.1)
-            if top - bottom < 0.25:
-                continue
-            families = ("picture", "picture", "window", "photo", "screen", "bookshelf")
-            origin = (area[1].start * RESOLUTION_M, area[0].start * RESOLUTION_M, bottom)
-            light = self.light[index] * rng.uniform(0.9, 1.15)
-            size = (width * RESOLUTION_M, top - bottom)
-            self.span[area] = self.surface(families, light, size, origin)
-            self.span_bottom[area], self.span_top[area] = bottom, top
-
-    # --- assembly -------------------------------------------------------------------------
-
-    def clear(self, rooms: list[Rect]) -> None:
-        """Empty rooms whose furniture cuts something off."""
-        for _ in range(3):
-            blocked = (self.solid > 0.03) | ((self.span_top > 0.03) & (self.span_bottom < 1.1))
-            clearance = ndimage.distance_transform_edt(~blocked) * RESOLUTION_M
-            label, count = ndimage.label(clearance > _PASSABLE_M)
-            if count <= 1:
-                return
-            sizes = ndimage.sum_labels(np.ones_like(label), label, np.arange(1, count + 1))
-            main = int(np.argmax(sizes)) + 1
-            for index, (row, column, rows, columns) in enumerate(rooms):
-                area = np.s_[row : row + rows, column : column + columns]
-                here = label[area]
-                cut_off = ((here > 0) & (here != main)).sum()
-                if cut_off > 60 or not (here == main).any():
-                    self.solid[area] = 0.0
-                    low = self.span_bottom[area] < 1.1
-                    self.span_top[area] = np.where(low, 0.0, self.span_top[area])
-                    self.span_bottom[area] = np.where(low, 0.0, self.span_bottom[area])
-
-    def build(self) -> World:
-        rooms: list[Rect] = []
-        inner = (_BORDER, _BORDER, self.rows - 2 * _BORDER, self.columns - 2 * _BORDER)
-        self.split(inner, rooms)
-        self.paint_rooms(rooms)
-        self.cut_doors(rooms)
-        for index, room in enumerate(rooms):
-            self.furnish(index, room)
-            self.hang(index, room)
-        self.clear(rooms)
-        tint = np.clip(np.array(self.tint, np.float32), 0.2, 1.4)
+    def finish(self, textures: NDArray[np.uint8], name: str) -> World:
+        """Return the finished world, no span reaching into what stands under it."""
+        hidden = self.solid_top >= self.span_top
+        self.span_top[hidden] = self.span_bottom[hidden] = 0.0
+        self.span_bottom = np.where(hidden, 0.0, np.maximum(self.span_bottom, self.solid_top))
         return World(
-            self.solid, self.span_bottom, self.span_top, self.side, self.cap, self.span,
-            self.floor, self.roof, self.ceiling,
-            Surfaces(
-                np.array(self.texture, np.int32),
-                np.array(self.origin, np.float32),
-                np.array(self.size, np.float32),
-                tint,
-            ),
-            self.bank,
-            name=f"generated-{self.seed}",
+            self.solid_top, self.span_bottom, self.span_top, self.side, self.cap, self.span,
+            self.floor, self.ceiling, self.ceiling_m, self.table.finish(), textures, name=name,
         )  # fmt: skip
+
+    def _paint_room(self, index: int) -> None:
+        rect, look, rng = self.layout.rooms[index].rect, self.looks[index], self.rng
+        self.solid_top[rect.slices] = 0.0
+        size = (look.floor_size_m, look.floor_size_m)
+        offset = (float(rng.uniform(0, 3)), float(rng.uniform(0, 3)), 0.0)
+        self.floor[rect.slices] = self.table.add(look.floor, size, look.tint, offset)
+        self.ceiling[rect.slices] = self.table.add(look.ceiling, (2.4, 2.4), look.tint)
+        for texture, strip in zip(look.walls, _strips(rect), strict=True):
+            offset = (float(rng.uniform(0, 5)), float(rng.uniform(0, 5)), 0.0)
+            repeat = (look.wall_width_m, self.ceiling_m)
+            row = self.table.add(texture, repeat, look.tint, offset)
+            self.side[strip] = self.span[strip] = row
+        if rng.random() < 0.4 and min(rect.width, rect.height) > 40:
+            rug = self._somewhere(rect, (1.0, 3.2), 4)
+            self.floor[rug.slices] = self._fitted(pick(rng, "rug"), rug, look.tint)
+
+    def _cut(self, opening: Opening, frame: int | None) -> None:
+        """Open a wall: free below, a lintel above; each half belongs to the nearer room."""
+        rect = opening.rect
+        self.solid_top[rect.slices] = 0.0
+        second = (
+            Rect((rect.x0 + rect.x1) // 2, rect.y0, rect.x1, rect.y1)
+            if opening.along_x
+            else Rect(rect.x0, (rect.y0 + rect.y1) // 2, rect.x1, rect.y1)
+        )
+        for room, half in ((opening.first, rect), (opening.second, second)):
+            beyond = self.layout.rooms[room].rect
+            self.floor[half.slices] = self.floor[beyond.y0, beyond.x0]
+            self.ceiling[half.slices] = self.ceiling[beyond.y0, beyond.x0]
+        if opening.lintel_m:  # the wall's own surface is already there, from both rooms
+            self.span_bottom[rect.slices] = min(opening.lintel_m, self.ceiling_m - 0.1)
+            self.span_top[rect.slices] = self.ceiling_m
+        if frame is not None:
+            row = self.table.add(frame, (1.0, 2.0), self.looks[opening.first].tint)
+            posts = rect.grown(0, 2) if opening.along_x else rect.grown(2, 0)
+            inside = np.zeros_like(self.side[posts.slices], np.bool_)
+            inside[self.solid_top[posts.slices] >= self.ceiling_m] = True
+            self.side[posts.slices][inside] = row
+
+    def _stand(self, footprint: Footprint, tint: Tint) -> None:
+        part, where, mask = footprint.part, footprint.where, footprint.mask
+        top_m = min(part.top_m, self.ceiling_m)
+        y0, x0 = where[0].start * RESOLUTION_M, where[1].start * RESOLUTION_M
+        box = Rect(where[1].start, where[0].start, where[1].stop, where[0].stop)
+        height = max(top_m - part.bottom_m, 0.05)
+        size = (part.width_m, height) if part.fit else (1.2, 1.2)
+        side = self.table.add(part.side, size, tint, (x0, y0, part.bottom_m))
+        if part.bottom_m > 0.0:
+            higher = mask & (self.span_top[where] < top_m)  # one span a cell: the highest stays
+            self.span_bottom[where][higher] = part.bottom_m
+            self.span_top[where][higher] = top_m
+            self.span[where][higher] = side
+            return
+        higher = mask & (self.solid_top[where] < top_m)
+        self.solid_top[where][higher] = top_m
+        self.side[where][higher] = side
+        self.cap[where][higher] = self._fitted(part.cap, box, tint)
+
+    def _fitted(self, texture: int, rect: Rect, tint: Tint) -> int:
+        """Add a row whose texture lies once over a rectangle of floor, ceiling or top."""
+        size = (rect.width * RESOLUTION_M, rect.height * RESOLUTION_M)
+        return self.table.add(
+            texture, size, tint, (rect.x0 * RESOLUTION_M, rect.y0 * RESOLUTION_M, 0)
+        )
+
+    def _somewhere(self, rect: Rect, size_m: tuple[float, float], margin: int) -> Rect:
+        """Return a random rectangle inside a room, `margin` cells from its walls."""
+        limits = rect.width - 2 * margin, rect.height - 2 * margin
+        width, height = (min(to_cells(self.rng.uniform(*size_m)), limit) for limit in limits)
+        x0 = rect.x0 + margin + int(self.rng.integers(limits[0] - width + 1))
+        y0 = rect.y0 + margin + int(self.rng.integers(limits[1] - height + 1))
+        return Rect(x0, y0, x0 + width, y0 + height)
+
+    def _light_room(self, index: int) -> None:
+        rect, look = self.layout.rooms[index].rect, self.looks[index]
+        lamp = pick(self.rng, "lamp")
+        for _ in range(int(self.rng.poisson(0.08 * rect.area_m2))):
+            panel = self._somewhere(rect, (0.25, 1.2), 5)
+            tint = np.clip(1.25 * look.tint, 0.0, 1.3)
+            self.ceiling[panel.slices] = self._fitted(lamp, panel, tint)
+
+    def _hang_pictures(self, index: int) -> None:
+        """Hang pictures, boards and shelves on free stretches of wall, one cell deep."""
+        rng, rect = self.rng, self.layout.rooms[index].rect
+        plenty = rng.uniform(0.0, 0.6)  # some rooms stay bare
+        for side, strip in enumerate(_strips(rect)):
+            length = rect.height if side < 2 else rect.width
+            for _ in range(int(rng.poisson(plenty * length * RESOLUTION_M))):
+                width = min(to_cells(rng.uniform(0.3, 1.6)), length)
+                start = int(rng.integers(length - width + 1))
+                bottom = float(rng.uniform(1.12, 1.5))
+                top = min(bottom + float(rng.uniform(0.35, 0.9)), self.ceiling_m - 0.1)
+                if side < 2:
+                    x0 = rect.x0 if side == 0 else rect.x1 - 1
+                    box = Rect(x0, rect.y0 + start, x0 + 1, rect.y0 + start + width)
+                    behind = (box.slices[0], strip[1])
+                else:
+                    y0 = rect.y0 if side == 2 else rect.y1 - 1
+                    box = Rect(rect.x0 + start, y0, rect.x0 + start + width, y0 + 1)
+                    behind = (strip[0], box.slices[1])
+                bare = (self.solid_top[behind] >= self.ceiling_m).all()
+                crowded = (self.solid_top[box.slices] > bottom - 0.05).any()
+                if not bare or crowded or self.span_top[box.slices].any():
+                    continue
+                shown = pick(rng, "picture", "picture", "picture", "photo", "photo", "bookshelf")
+                origin = (box.x0 * RESOLUTION_M, box.y0 * RESOLUTION_M, bottom)
+                tint = self.looks[index].tint * rng.uniform(0.9, 1.1)
+                size = (width * RESOLUTION_M, top - bottom)
+                self.span[box.slices] = self.table.add(shown, size, tint, origin)
+                self.span_bottom[box.slices], self.span_top[box.slices] = bottom, top
+
+
+def _strips(rect: Rect) -> tuple[tuple[slice, slice], ...]:
+    """Return the wall cells seen from a room: left, right, bottom, top."""
+    rows, columns = rect.slices
+    return (
+        (rows, slice(rect.x0 - 1, rect.x0)),
+        (rows, slice(rect.x1, rect.x1 + 1)),
+        (slice(rect.y0 - 1, rect.y0), columns),
+        (slice(rect.y1, rect.y1 + 1), columns),
+    )

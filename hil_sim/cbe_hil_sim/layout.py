@@ -13,6 +13,7 @@ from cbe_hil_sim.world import RESOLUTION_M
 
 Rng = np.random.Generator
 OUTER_WALL = 5
+SMALLEST_M2 = 90.0  # of floor: 100 m2 with its walls
 
 
 def to_cells(length_m: float) -> int:
@@ -112,8 +113,10 @@ class Style:
 STYLES = (
     Style(
         "house", (100.0, 300.0), (10.0, 34.0), 2.5, (1.1, 1.8), 1, 0.6, 0.3, 0.35,
-        ("living", "kitchen", "dining", "bedroom", "bedroom", "study", "bath", "bedroom", "storage"),
-        2,
+        (
+            "living", "kitchen", "dining", "bedroom", "bedroom", "study", "bath", "bedroom",
+            "storage",
+        ), 2,
     ),
     Style(
         "apartment", (100.0, 160.0), (9.0, 28.0), 2.3, (1.1, 1.6), 1, 0.8, 0.25, 0.2,
@@ -228,11 +231,12 @@ def _without_corner(rng: Rng, rooms: list[Room], rect: Rect) -> list[Room]:
         and (room.rect.x0 == rect.x0 or room.rect.x1 == rect.x1)
         and (room.rect.y0 == rect.y0 or room.rect.y1 == rect.y1)
     ]
-    if len(rooms) < 5 or not corners:
+    if not corners:
         return rooms
     dropped = corners[int(rng.integers(len(corners)))]
     kept = [room for room in rooms if room is not dropped]
-    return kept if _label(kept, _borders(kept)).max() == 0 else rooms
+    joined = bool(kept) and _label(kept, _borders(kept)).max() == 0
+    return kept if joined and sum(r.rect.area_m2 for r in kept) >= SMALLEST_M2 else rooms
 
 
 def _name_kinds(rng: Rng, rooms: list[Room], style: Style) -> list[Room]:
@@ -265,7 +269,7 @@ def draw_layout(rng: Rng) -> Layout:
     main = np.argmax(np.bincount(labels))
     rooms = _name_kinds(rng, [r for r, k in zip(rooms, labels, strict=True) if k == main], style)
     borders = _borders(rooms)
-    halls = [rooms[b.first].kind == "corridor" or rooms[b.second].kind == "corridor" for b in borders]
+    halls = ["corridor" in (rooms[b.first].kind, rooms[b.second].kind) for b in borders]
     weight = rng.uniform(0.2, 1.0, len(borders)) - 0.15 * np.asarray(halls)  # prefer the corridor
     index = ([b.first for b in borders], [b.second for b in borders])
     tree = minimum_spanning_tree(coo_array((weight, index), shape=(len(rooms), len(rooms))).tocsr())

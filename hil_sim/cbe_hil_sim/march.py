@@ -1,6 +1,7 @@
 """Compiled front-to-back march over the cells of a world: images and scans.
 
-One file, because numba's cache does not notice a change in another file.
+One file, because numba's cache does not notice a change in another file; the constants
+imported here are compiled in, so delete __pycache__ after changing those.
 """
 
 import math
@@ -8,7 +9,6 @@ from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from cbe_hil_sim.world import (
     SHADE_DOWN,
@@ -24,14 +24,14 @@ NEAR_M = 1e-4  # depth of the face seen by a camera that stands inside a solid
 FAR = 1e5  # keeps what a level row would hit finite
 LEVEL_START = np.array([(4**LEVELS - 4 ** (LEVELS - n)) // 3 for n in range(LEVELS)], np.int64)
 SIDE, CAP, SPAN = 0, 1, 2  # columns of WorldBatch.surface
-FLOOR, CEILING = 0, 1  # columns of WorldBatch.level
+CEILING = 1  # and 0 the floor: columns of WorldBatch.level
 ALONG_X, ALONG_Y = 0, 1  # normal of a vertical face
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _advance(
     x: float, y: float, dx: float, dy: float, per_dx: float, per_dy: float,
-    column: int, row: int, reach: int,
+    column: int, row: int, reach: Any,
 ) -> tuple[int, int, float, int]:  # fmt: skip
     """Leave the box of `reach` - 1 cells round a cell: next column, row, ray length, normal.
 
@@ -41,16 +41,16 @@ def _advance(
     to_x = ((column + reach if dx >= 0.0 else column + 1 - reach) - x) * per_dx
     to_y = ((row + reach if dy >= 0.0 else row + 1 - reach) - y) * per_dy
     if to_x < to_y:
-        across = int(math.floor(y + to_x * dy))
+        across = math.floor(y + to_x * dy)
         row = min(max(across, row + 1 - reach), row + reach - 1)  # against rounding
         return column + (reach if dx >= 0.0 else -reach), row, to_x, ALONG_X
-    across = int(math.floor(x + to_y * dx))
+    across = math.floor(x + to_y * dx)
     column = min(max(across, column + 1 - reach), column + reach - 1)
     return column, row + (reach if dy >= 0.0 else -reach), to_y, ALONG_Y
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _paint(
+def _paint_side(
     batch: Any, surface: int, normal: int, shade: float, u_at: float, v_at: float,
     v_step: float, footprint: float, first: int, last: int, filled: Any, colour: Any,
 ) -> None:  # fmt: skip
@@ -62,7 +62,7 @@ def _paint(
     mask = size - 1
     start = batch.texture[surface] + LEVEL_START[level]
     u = (u_at - placement[1 if normal == ALONG_X else 0]) * placement[3]
-    start += (int(math.floor(u * size)) & mask) * size
+    start += (math.floor(u * size) & mask) * size
     v_scale = placement[4] * size
     v = (v_at - placement[2]) * v_scale
     v_step *= v_scale
@@ -73,7 +73,7 @@ def _paint(
     for sub_row in range(first, last + 1):
         if filled[sub_row] == 0:
             filled[sub_row] = 1
-            texel = start + (~int(math.floor(v + (sub_row - first) * v_step)) & mask)
+            texel = start + (~math.floor(v + (sub_row - first) * v_step) & mask)
             colour[sub_row, 0] = min(batch.texels[texel, 0] * red, white)
             colour[sub_row, 1] = min(batch.texels[texel, 1] * green, white)
             colour[sub_row, 2] = min(batch.texels[texel, 2] * blue, white)
@@ -104,12 +104,49 @@ def _paint_plane(
             size = TEXTURE_SIZE >> level
             mask = size - 1
             depth = depth_per_rise[sub_row]
-            across = int(math.floor((u + depth * du) * size)) & mask
-            down = ~int(math.floor((v + depth * dv) * size)) & mask
+            across = math.floor((u + depth * du) * size) & mask
+            down = ~math.floor((v + depth * dv) * size) & mask
             texel = start + LEVEL_START[level] + across * size + down
             colour[sub_row, 0] = min(batch.texels[texel, 0] * red, white)
             colour[sub_row, 1] = min(batch.texels[texel, 1] * green, white)
             colour[sub_row, 2] = min(batch.texels[texel, 2] * blue, white)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _paint_open(
+    batch: Any, world: int, x: float, y: float, dx: float, dy: float, camera_x_m: float,
+    camera_y_m: float, camera_z_m: float, dx_m: float, dy_m: float, middle: float,
+    depth_per_rise: Any, footprint: Any, filled: Any, colour: Any,
+) -> None:  # fmt: skip
+    """Paint the floor and the ceiling where the column is still open, in runs of one surface."""
+    rows, columns = batch.shape[world]
+    first_cell, first_surface = batch.first_cell[world], batch.first_surface[world]
+    sub_rows = len(filled)
+    horizon = min(max(math.ceil(middle), 0), sub_rows)
+    for plane in range(2):
+        rise, shade, first, end = -camera_z_m, SHADE_UP, horizon, sub_rows
+        if plane == CEILING:
+            rise, shade, first, end = batch.ceiling_m[world] - camera_z_m, SHADE_DOWN, 0, horizon
+        surface = np.int64(-1)
+        for sub_row in range(first, end):
+            if filled[sub_row] == 0:
+                depth = rise * depth_per_rise[sub_row]
+                column = min(max(math.floor(x + depth * dx), 0), columns - 1)
+                row = min(max(math.floor(y + depth * dy), 0), rows - 1)
+                here = np.int64(batch.level[first_cell + row * columns + column, plane])
+                if here != surface:
+                    if surface >= 0:
+                        _paint_plane(
+                            batch, first_surface + surface, shade, camera_x_m, camera_y_m,
+                            dx_m, dy_m, rise, depth_per_rise, footprint, first, sub_row - 1,
+                            filled, colour,
+                        )  # fmt: skip
+                    surface, first = here, sub_row
+        if surface >= 0:
+            _paint_plane(
+                batch, first_surface + surface, shade, camera_x_m, camera_y_m, dx_m, dy_m,
+                rise, depth_per_rise, footprint, first, end - 1, filled, colour,
+            )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -152,7 +189,7 @@ def _render_image(
         # A wall seen at a slant covers more of itself in one column.
         slant_x = -0.5 * math.log2(max(abs(dx_m), 1e-3)) - log2_focal
         slant_y = -0.5 * math.log2(max(abs(dy_m), 1e-3)) - log2_focal
-        column, row = int(math.floor(x)), int(math.floor(y))
+        column, row = math.floor(x), math.floor(y)
         inside = 0 <= column < columns and 0 <= row < rows
         cell = first_cell + min(max(row, 0), rows - 1) * columns + min(max(column, 0), columns - 1)
         near, normal = NEAR_M, ALONG_X
@@ -177,18 +214,18 @@ def _render_image(
             near = max(near, NEAR_M)
             far = max(far, near)
             per_m = fy / near  # sub-rows per metre of height at the near edge
-            top = max(top, int(math.ceil(middle - (ceiling_m - camera_z_m) * per_m)))
-            bottom = min(bottom, int(math.floor(middle + camera_z_m * per_m)))
+            top = max(top, math.ceil(middle - (ceiling_m - camera_z_m) * per_m))
+            bottom = min(bottom, math.floor(middle + camera_z_m * per_m))
 
             shade, along_m = shade_x, camera_y_m + near * dy_m
             slant = slant_x
             if normal == ALONG_Y:
                 shade, along_m, slant = shade_y, camera_x_m + near * dx_m, slant_y
             if solid > solid_before:
-                first = max(top, int(math.ceil(middle - (solid - camera_z_m) * per_m)))
-                last = min(bottom, int(math.floor(middle - (solid_before - camera_z_m) * per_m)))
+                first = max(top, math.ceil(middle - (solid - camera_z_m) * per_m))
+                last = min(bottom, math.floor(middle - (solid_before - camera_z_m) * per_m))
                 if first <= last:
-                    _paint(
+                    _paint_side(
                         batch, first_surface + batch.surface[cell, SIDE], normal, shade, along_m,
                         camera_z_m + (middle - first) / per_m, -1.0 / per_m,
                         math.log2(near) + slant, first, last, filled, colour,
@@ -197,29 +234,29 @@ def _render_image(
                 break
             new_span = span_bottom < span_bottom_before or span_top > span_top_before
             if span_top > 0.0 and new_span:
-                first = max(top, int(math.ceil(middle - (span_top - camera_z_m) * per_m)))
-                last = min(bottom, int(math.floor(middle - (span_bottom - camera_z_m) * per_m)))
+                first = max(top, math.ceil(middle - (span_top - camera_z_m) * per_m))
+                last = min(bottom, math.floor(middle - (span_bottom - camera_z_m) * per_m))
                 if first <= last:
-                    _paint(
+                    _paint_side(
                         batch, first_surface + batch.surface[cell, SPAN], normal, shade, along_m,
                         camera_z_m + (middle - first) / per_m, -1.0 / per_m,
                         math.log2(near) + slant, first, last, filled, colour,
                     )  # fmt: skip
 
-            for face in range(3):  # span's upper face, span's underside, solid's cap
+            for face in range(3):  # nearest first: span's top, span's underside, solid's cap
                 height_m, surface, shade = span_top, SPAN, SHADE_UP
                 if face == 1:
                     height_m, shade = span_bottom, SHADE_DOWN
                 elif face == 2:
                     height_m, surface = solid, CAP
-                under = face == 1
-                rise = height_m - camera_z_m
-                if height_m <= 0.0 or (face < 2 and span_top <= 0.0) or under != (rise > 0.0):
+                rise, under = height_m - camera_z_m, face == 1
+                absent = span_top <= 0.0 if face < 2 else solid <= 0.0
+                if absent or rise == 0.0 or under != (rise > 0.0):
                     continue
                 at_near, at_far = middle - rise * per_m, middle - rise * fy / far
-                first = max(top, int(math.ceil(at_near if under else at_far)))
-                last = min(bottom, int(math.floor(at_far if under else at_near)))
-                if first > last or rise == 0.0:
+                first = max(top, math.ceil(at_near if under else at_far))
+                last = min(bottom, math.floor(at_far if under else at_near))
+                if first > last:
                     continue
                 _paint_plane(
                     batch, first_surface + batch.surface[cell, surface], shade, camera_x_m,
@@ -239,32 +276,10 @@ def _render_image(
             if inside:
                 cell = first_cell + row * columns + column
 
-        # What is still open sees the floor or the ceiling, painted in runs of one surface.
-        horizon = min(max(int(math.ceil(middle)), 0), sub_rows)
-        for plane in range(2):
-            rise, shade, first, end = -camera_z_m, SHADE_UP, horizon, sub_rows
-            if plane == CEILING:
-                rise, shade, first, end = ceiling_m - camera_z_m, SHADE_DOWN, 0, horizon
-            surface = -1
-            for sub_row in range(first, end):
-                if filled[sub_row] == 0:
-                    depth = rise * depth_per_rise[sub_row]
-                    column = min(max(int(math.floor(x + depth * dx)), 0), columns - 1)
-                    row = min(max(int(math.floor(y + depth * dy)), 0), rows - 1)
-                    here = np.int64(batch.level[first_cell + row * columns + column, plane])
-                    if here != surface:
-                        if surface >= 0:
-                            _paint_plane(
-                                batch, first_surface + surface, shade, camera_x_m, camera_y_m,
-                                dx_m, dy_m, rise, depth_per_rise, footprint, first, sub_row - 1,
-                                filled, colour,
-                            )  # fmt: skip
-                        surface, first = here, sub_row
-            if surface >= 0:
-                _paint_plane(
-                    batch, first_surface + surface, shade, camera_x_m, camera_y_m, dx_m, dy_m,
-                    rise, depth_per_rise, footprint, first, end - 1, filled, colour,
-                )  # fmt: skip
+        _paint_open(
+            batch, world, x, y, dx, dy, camera_x_m, camera_y_m, camera_z_m, dx_m, dy_m, middle,
+            depth_per_rise, footprint, filled, colour,
+        )  # fmt: skip
         sub_row = 0
         for pixel_row in range(image.shape[0]):
             for _ in range(supersample):
@@ -311,7 +326,7 @@ def scan_rays(
             dx, dy = math.cos(angle) / cell_m, math.sin(angle) / cell_m
             per_dx = 1.0 / dx if dx != 0.0 else np.inf
             per_dy = 1.0 / dy if dy != 0.0 else np.inf
-            column, row = int(math.floor(x)), int(math.floor(y))
+            column, row = math.floor(x), math.floor(y)
             distance = 0.0
             while distance <= range_m and 0 <= column < columns and 0 <= row < rows:
                 cell = first_cell + row * columns + column

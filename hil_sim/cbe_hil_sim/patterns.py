@@ -56,13 +56,13 @@ def fill(base: Floats) -> Floats:
     return np.full((SIZE, SIZE, 3), base, np.float32)
 
 
-def mix(low: Floats, high: Floats, weight: Floats) -> Floats:
+def mix(low: Floats, high: Floats, weight: NDArray[np.floating]) -> Floats:
     """Blend two colours or images by a field in [0, 1] (clipped)."""
     w = np.clip(weight, 0.0, 1.0)[..., None]
     return np.ascontiguousarray(low * (1.0 - w) + high * w, np.float32)
 
 
-def modulate(image: Floats, field: Floats, strength: float) -> Floats:
+def modulate(image: Floats, field: NDArray[np.floating], strength: float) -> Floats:
     """Brighten and darken an image by a field of about unit deviation."""
     out = image * (1.0 + np.float32(strength) * field[..., None])
     return np.ascontiguousarray(out, np.float32)

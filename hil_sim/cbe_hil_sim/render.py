@@ -1,24 +1,20 @@
 """Camera images of 2.5-D worlds: each image column is one march over the grid."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
+from cbe.camera import CameraModel
 from cbe.errors import CameraError
 from cbe.robot import Robot
 from cbe_hil_sim.march import render_images
 from cbe_hil_sim.worldbatch import WorldBatch
-
-if TYPE_CHECKING:
-    from cbe.camera import CameraModel
 
 
 def render(
     batch: WorldBatch,
     world_index: NDArray[np.integer],
     pose: NDArray[np.floating],
-    camera: "CameraModel",
+    camera: CameraModel,
     *,
     supersample: int = 2,
     height_m: NDArray[np.floating] | None = None,
@@ -31,13 +27,15 @@ def render(
     mast's height, `pitch_px` (B,) moves the horizon down by so many pixels. Each pixel is the
     mean of `supersample` x `supersample` rays. Outside its grid a world is solid.
 
-    Raises CameraError for a distorted camera and WorldError for bad indices or poses.
+    Raises CameraError for a distorted camera or no rays and WorldError for bad indices or poses.
     """
     if camera.model != "pinhole" or any(camera.distortion):
         raise CameraError(
             f"the column renderer draws undistorted pinhole views; found {camera.model!r} with "
             f"distortion {camera.distortion}; render a pinhole view and remap it"
         )
+    if supersample < 1:
+        raise CameraError(f"supersample is {supersample}; expected 1, 2 or more rays a side")
     world_index = np.asarray(world_index, np.int64)
     camera_pose = np.array(pose, np.float64)
     batch.check(world_index, camera_pose)

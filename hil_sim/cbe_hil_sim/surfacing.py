@@ -85,7 +85,7 @@ _WALLS = {
     "storage": ("plaster", "brick"),
 }
 _HOME_FLOORS = ("wood_floor", "wood_floor", "parquet", "carpet", "tile_floor")
-_HOME_WALLS = ("plaster", "plaster", "wallpaper", "wallpaper", "panelling", "mural")
+_HOME_WALLS = ("plaster", "plaster", "plaster", "wallpaper", "wallpaper", "panelling", "panelling")
 _OFFICE_WALLS = ("plaster", "plaster", "plaster", "plaster", "wallpaper", "panelling", "brick")
 
 

@@ -2,7 +2,6 @@
 
 from functools import cache
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -78,6 +77,6 @@ def bank(split: str) -> NDArray[np.uint8]:
     for k in range(PHOTO_COUNT):
         rng = np.random.default_rng([key, len(PAINTERS), k])
         images.append(furnishings.photo(rng, PHOTO_COLUMNS[split]))
-    stacked = np.stack([cv2.convertScaleAbs(np.clip(image, 0.0, 255.0)) for image in images])
+    stacked = np.clip(np.rint(np.stack(images)), 0.0, 255.0).astype(np.uint8)
     stacked.setflags(write=False)
     return stacked

@@ -163,15 +163,13 @@ def _pack_cells(
 
 def _reach(content: NDArray[np.floating]) -> NDArray[np.int64]:
     """Chessboard distance (rows, columns) to the nearest cell of other `content` (..., K)."""
-    rows, columns = content.shape[:2]
-    alike = np.zeros((rows, columns), np.bool_)  # the cells beyond the edge are unlike
-    middle = content[1:-1, 1:-1]
-    alike[1:-1, 1:-1] = True
-    for row, column in ((0, 0), (0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1), (2, 2)):
-        shifted = content[row : rows - 2 + row, column : columns - 2 + column]
-        alike[1:-1, 1:-1] &= (shifted == middle).all(axis=-1)
-    distance = 1 + ndimage.distance_transform_cdt(alike, metric="chessboard").astype(np.int64)
-    return np.minimum(distance, REACH)
+    across = (content[:, 1:] == content[:, :-1]).all(axis=-1)
+    down = (content[1:] == content[:-1]).all(axis=-1)
+    alike = np.zeros(content.shape[:2], np.bool_)  # what lies beyond the edge is unlike
+    level = across[:, 1:] & across[:, :-1]  # as left and right
+    alike[1:-1, 1:-1] = level[:-2] & level[1:-1] & level[2:] & (down[:-1] & down[1:])[:, 1:-1]
+    distance: NDArray[np.int64] = ndimage.distance_transform_cdt(alike, metric="chessboard")
+    return np.minimum(distance + 1, REACH)
 
 
 def _pack_placement(world: World) -> NDArray[np.float32]:

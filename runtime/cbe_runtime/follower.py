@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+
 from cbe.controller import Motion, RmpController, twist
 from cbe.errors import ModelError
 from cbe.robot import STEP_S, Robot
 from cbe.stop_zone import limit
-
+from cbe_runtime.behavior import Behavior
 from cbe_runtime.observation import Observation, StampWatch, usable_image, usable_ranges
 from cbe_runtime.state import Events, Reason, State, StateMachine
 
@@ -93,7 +94,19 @@ class Follower:
         self._start = False
         self._stop = False
         self._motion = Motion(np.zeros(1), np.zeros(1))
-        self._restart()
+        self._command = (0.0, 0.0)  # m/s, rad/s
+        self._behavior = Behavior(networks, route, 0)
+        self._age_steps = 0  # steps spent on the present segment
+        self._done_ticks = 0  # ticks in a row that called it done
+        self._since_tick_steps = networks.network_period
+        self._seen_stamp_ns: int | None = None
+        self._prediction: Prediction | None = None
+        self._waypoint_m: tuple[float, float] | None = None  # at the present pose
+
+    @property
+    def model_id(self) -> str:
+        """Of the networks in use."""
+        return self._networks.model_id
 
     @property
     def state(self) -> State:
@@ -120,7 +133,7 @@ class Follower:
         if self._start and self._machine.state in {State.IDLE, State.ARRIVED}:
             self._restart()
         elif self._start:
-            self._segment_age_steps = 0
+            self._age_steps = 0
         self._machine.update(Events(start=self._start, stop=self._stop, fault=fault))
         self._start = self._stop = False
 
@@ -149,12 +162,10 @@ class Follower:
 
     def _follow(self, image: NDArray[np.uint8], frame: Frame) -> bool:
         """Run the networks if they are due; tells whether they ran."""
-        self._segment_age_steps += 1
+        self._age_steps += 1
         self._since_tick_steps += 1
-        length = self._route.segments[self._segment].steps
-        if self._segment_age_steps > (
-            self._config.timeout_factor * length + self._config.timeout_steps
-        ):
+        config = self._config
+        if self._age_steps > config.timeout_factor * self._behavior.steps + config.timeout_steps:
             self._machine.update(Events(fault=Reason.TIMEOUT))
             return False
         # A frame is seen once, however often it is delivered: the encoder counts frames.
@@ -162,7 +173,7 @@ class Follower:
         if not due or frame.stamp_ns == self._seen_stamp_ns:
             return False
         try:
-            prediction = self._tick(image)
+            prediction = self._behavior.tick(image)
         except ModelError:
             self._machine.update(Events(fault=Reason.MODEL_FAULT))
             return False
@@ -173,29 +184,9 @@ class Follower:
         self._judge_progress(prediction.progress)
         return True
 
-    def _tick(self, image: NDArray[np.uint8]) -> Prediction:
-        """One tick of all networks; the state moves on only if every output was finite."""
-        networks = self._networks
-        features, embedding, encoder_state = networks.encode(image, self._encoder_state)
-        attractor = networks.attract(features)
-        first = attractor if self._attractor_first is None else self._attractor_first
-        prediction, generator_state = networks.generate(
-            attractor_now=attractor,
-            attractor_first=first,
-            attractor_start=self._attractor_start,
-            attractor_goal=self._attractor_goal,
-            embedding_now=embedding,
-            embedding_goal=self._embedding_goal,
-            state=self._generator_state,
-        )
-        self._attractor_first = first
-        self._encoder_state = encoder_state
-        self._generator_state = generator_state
-        return prediction
-
     def _judge_progress(self, progress: float) -> None:
         """Start the next behavior, or arrive, once enough ticks in a row say so."""
-        last = self._segment + 1 == len(self._route.segments)
+        last = self._behavior.last
         threshold = self._config.arrival_progress if last else self._config.switch_progress
         self._done_ticks = self._done_ticks + 1 if progress >= threshold else 0
         if self._done_ticks < self._config.progress_ticks:
@@ -203,26 +194,21 @@ class Follower:
         if last:
             self._machine.update(Events(arrived=True))
         else:
-            self._begin(self._segment + 1)
-
-    def _restart(self) -> None:
-        self._seen_stamp_ns: int | None = None
-        self._since_tick_steps = self._networks.network_period
-        self._prediction: Prediction | None = None
-        self._waypoint_m: tuple[float, float] | None = None
-        self._begin(0)
+            self._begin(self._behavior.segment + 1)
 
     def _begin(self, segment: int) -> None:
         """Enter a segment with every recurrent state reset; its first frame is the next one."""
-        self._segment = segment
-        self._attractor_start = self._route.attractor(segment)
-        self._attractor_goal = self._route.attractor(segment + 1)
-        self._embedding_goal = self._route.embedding(segment)
-        self._attractor_first: NDArray[np.float32] | None = None
-        self._encoder_state = self._networks.encoder_state()
-        self._generator_state = self._networks.generator_state()
+        self._behavior = Behavior(self._networks, self._route, segment)
         self._done_ticks = 0
-        self._segment_age_steps = 0
+        self._age_steps = 0
+
+    def _restart(self) -> None:
+        """Forget everything and stand before the route's first segment."""
+        self._prediction = None
+        self._waypoint_m = None
+        self._seen_stamp_ns = None
+        self._since_tick_steps = self._networks.network_period
+        self._begin(0)
 
     def _move(self, ranges_m: NDArray[np.float64] | None) -> None:
         """Set the motion commanded for this step."""
@@ -271,7 +257,7 @@ class Follower:
             yaw_rate_rad_s=self._command[1],
             state=self._machine.state,
             reason=self._machine.reason,
-            segment=self._segment,
+            segment=self._behavior.segment,
             segments=len(self._route.segments),
             progress=prediction.progress if prediction else 0.0,
             on_route=prediction.on_route if prediction else 0.0,

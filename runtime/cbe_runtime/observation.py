@@ -6,15 +6,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from cbe.signature import IMAGE_SIZE
 
+from cbe.signature import IMAGE_SIZE
 from cbe_runtime.state import Reason
 
 if TYPE_CHECKING:
-    from cbe.robot import Robot
     from numpy.typing import NDArray
 
-MAX_INVALID_RAYS = 0.2
+    from cbe.robot import Robot
+
+MAX_INVALID_RAYS = 0.5
 """Share of NaN rays up to which the neighbours stand in for them."""
 
 
@@ -93,10 +94,9 @@ def usable_ranges(scan: Scan, robot: Robot) -> NDArray[np.float64] | None:
     A few NaN rays take the nearer of the valid neighbours' ranges; too many of them, a negative
     range or a wrong number of rays make the scan unusable.
     """
-    ranges = scan.ranges_m
-    if ranges is None or ranges.shape != (robot.scan_rays,):
+    if scan.ranges_m is None or scan.ranges_m.shape != (robot.scan_rays,):
         return None
-    ranges = ranges.astype(np.float64)
+    ranges = scan.ranges_m.astype(np.float64)
     invalid = np.isnan(ranges)
     if invalid.any():
         if invalid.mean() > MAX_INVALID_RAYS:

@@ -7,15 +7,16 @@ from enum import StrEnum
 from typing import TYPE_CHECKING
 
 import numpy as np
+
 from cbe.errors import RouteError
 from cbe.signature import ATTRACTOR_SIZE, EMBEDDING_SIZE
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from cbe.camera import CameraModel
     from numpy.typing import NDArray
 
+    from cbe.camera import CameraModel
     from cbe_runtime.networks import Networks
 
 
@@ -39,7 +40,7 @@ class AttractorPrecision(StrEnum):
         levels = 255 if self is AttractorPrecision.U8 else 15
         codes = np.rint(levels * np.clip(attractor, 0.0, 1.0)).astype(np.uint8)
         if self is AttractorPrecision.U4:
-            codes = (codes[0::2] << 4) | codes[1::2]  # (200,), two numbers a byte
+            return bytes((codes[0::2] << 4) | codes[1::2])  # (200,), two numbers a byte
         return codes.tobytes()
 
     def unpack(self, stored: bytes) -> NDArray[np.float32]:
@@ -75,10 +76,11 @@ class EmbeddingPrecision(StrEnum):
             return embedding.astype("<f4").tobytes()
         if self is EmbeddingPrecision.F16:
             largest = np.finfo(np.float16).max
-            return np.clip(embedding, -largest, largest).astype("<f2").tobytes()
-        scale = np.abs(embedding).max().astype("<f4") / np.float32(127)
-        codes = np.rint(embedding / max(scale, np.finfo(np.float32).tiny))
-        return scale.tobytes() + codes.astype(np.int8).tobytes()
+            clipped: NDArray[np.float32] = np.clip(embedding, -largest, largest)
+            return clipped.astype("<f2").tobytes()
+        scale = np.maximum(np.abs(embedding).max(keepdims=True) / 127, np.finfo(np.float32).tiny)
+        codes = np.rint(embedding / scale).astype(np.int8)
+        return b"".join([scale.astype("<f4").tobytes(), codes.tobytes()])
 
     def unpack(self, stored: bytes) -> NDArray[np.float32]:
         """The embedding (32,) float32 behind `size_bytes` bytes."""
@@ -86,7 +88,8 @@ class EmbeddingPrecision(StrEnum):
             name = "<f4" if self is EmbeddingPrecision.F32 else "<f2"
             return np.frombuffer(stored, name).astype(np.float32)
         scale = np.frombuffer(stored, "<f4", count=1)
-        return np.frombuffer(stored, np.int8, offset=4).astype(np.float32) * scale
+        values: NDArray[np.float32] = np.frombuffer(stored, np.int8, offset=4) * scale
+        return values.astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,8 +133,8 @@ class Route:
         """
         if not self.segments or len(self.attractors) != len(self.segments) + 1:
             raise RouteError(
-                f"the route has {len(self.segments)} segments and {len(self.attractors)} attractors, "
-                "expected at least one segment and one attractor more; teach it again"
+                f"the route has {len(self.segments)} segments and {len(self.attractors)} "
+                "attractors, expected at least one segment and one attractor more; teach it again"
             )
         _check_sizes("attractor", self.attractors, self.precision.attractor.size_bytes)
         embeddings = [segment.embedding for segment in self.segments]
@@ -174,7 +177,8 @@ def _check_sizes(what: str, stored: Sequence[bytes], size: int) -> None:
     for index, each in enumerate(stored):
         if len(each) != size:
             raise RouteError(
-                f"{what} {index} of the route has {len(each)} bytes, expected {size}; teach it again"
+                f"{what} {index} of the route has {len(each)} bytes, expected {size}; "
+                "teach it again"
             )
 
 

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import msgpack
 import msgspec
+
 from cbe.camera import CameraModel
 from cbe.errors import CbeError, RouteError
-
 from cbe_runtime.route import AttractorPrecision, EmbeddingPrecision, Precision, Route, Segment
 
 if TYPE_CHECKING:
@@ -101,7 +101,9 @@ def dump(route: Route) -> bytes:
         segments=tuple(_Segment(each.embedding, each.steps) for each in route.segments),
         tags=dict(route.tags),
     )
-    packed: bytes = msgpack.packb(msgspec.to_builtins(body, builtin_types=(bytes,)), use_single_float=True)
+    packed: bytes = msgpack.packb(
+        msgspec.to_builtins(body, builtin_types=(bytes,)), use_single_float=True
+    )
     envelope = {
         "magic": MAGIC,
         "version": VERSION,
@@ -120,14 +122,18 @@ def parse(data: bytes) -> Route:
     """
     envelope = _convert(_unpack(data, max_bin_len=MAX_FILE_BYTES), _Envelope)
     if envelope.magic != MAGIC:
-        raise RouteError(f"the file is no route: its magic is {envelope.magic!r}, expected {MAGIC!r}")
+        raise RouteError(
+            f"the file is no route: its magic is {envelope.magic!r}, expected {MAGIC!r}"
+        )
     if envelope.version != VERSION:
         raise RouteError(
             f"the route file has version {envelope.version}, this program reads {VERSION}; "
             "upgrade it or teach the route again"
         )
     if hashlib.sha256(envelope.body).digest() != envelope.sha256:
-        raise RouteError("the route file is damaged: its sha256 does not match; copy or teach it again")
+        raise RouteError(
+            "the route file is damaged: its sha256 does not match; copy or teach it again"
+        )
     body = _convert(_unpack(envelope.body, max_bin_len=MAX_FILE_BYTES), _Body)
     precision = Precision(*body.precision)
     size = precision.attractor.size_bytes
@@ -159,7 +165,9 @@ def load(path: Path) -> Route:
         with path.open("rb") as file:
             data = file.read(MAX_FILE_BYTES + 1)
     except OSError as error:
-        raise RouteError(f"cannot read the route {path}: {error.strerror}; check the path") from error
+        raise RouteError(
+            f"cannot read the route {path}: {error.strerror}; check the path"
+        ) from error
     if len(data) > MAX_FILE_BYTES:
         raise RouteError(f"{path} is larger than {MAX_FILE_BYTES} bytes; is it a route?")
     try:
@@ -218,7 +226,9 @@ def _convert(unpacked: Any, into: type[Checked]) -> Checked:
     try:
         return msgspec.convert(unpacked, into)
     except msgspec.ValidationError as error:
-        raise RouteError(f"the route file does not hold a route ({error}); teach it again") from error
+        raise RouteError(
+            f"the route file does not hold a route ({error}); teach it again"
+        ) from error
 
 
 def _camera(stored: _Camera) -> CameraModel:

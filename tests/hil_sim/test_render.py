@@ -1,11 +1,12 @@
 """The column renderer against brute-force ray casting of every cell's boxes."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from cbe.camera import MODEL_CAMERA, CameraModel
 from cbe.errors import CameraError, WorldError
 from cbe.robot import Robot
 from cbe_hil_sim.render import render
@@ -15,20 +16,6 @@ from cbe_hil_sim.worldbatch import LEVELS, TEXELS, WorldBatch, pyramid
 CEILING_M = 2.5
 CELL_M = 0.25
 SURFACES = 12
-
-
-@dataclass(frozen=True)
-class Camera:
-    """Stands in for CameraModel."""
-
-    width: int = 64
-    height: int = 64
-    fx: float = 18.48
-    fy: float = 23.68
-    cx: float = 32.0
-    cy: float = 32.0
-    model: str = "pinhole"
-    distortion: tuple[float, ...] = ()
 
 
 def flat_textures() -> NDArray[np.uint8]:
@@ -69,7 +56,11 @@ def small_world(seed: int, textures: NDArray[np.uint8], size_m: float = 0.7) -> 
 
 
 def brute_force(
-    world: World, camera_pose: NDArray[np.float64], camera_z_m: float, camera: Camera, cy: float
+    world: World,
+    camera_pose: NDArray[np.float64],
+    camera_z_m: float,
+    camera: CameraModel,
+    cy: float,
 ) -> NDArray[np.float64]:
     """Cast one ray a pixel at every box of the world; returns RGB (h, w, 3)."""
     left = (camera.cx - (np.arange(camera.width) + 0.5)) / camera.fx
@@ -82,7 +73,8 @@ def brute_force(
     rays = direction.reshape(-1, 3)  # (h * w, 3)
     eye = np.array([camera_pose[0], camera_pose[1], camera_z_m])
 
-    depth = np.where(rays[:, 2] < 0, -eye[2] / rays[:, 2], (CEILING_M - eye[2]) / rays[:, 2])
+    rays[rays == 0.0] = 1e-9  # a level ray
+    depth = np.where(rays[:, 2] < 0, -eye[2], CEILING_M - eye[2]) / rays[:, 2]
     axis = np.full(len(rays), 2)
     point = eye + depth[:, None] * rays
     cells = world.cells(point)
@@ -145,7 +137,7 @@ def same_share(image: NDArray[np.uint8], exact: NDArray[np.float64]) -> float:
 
 
 def test_every_surface_appears_where_ray_casting_sees_it() -> None:
-    camera, textures = Camera(), flat_textures()
+    camera, textures = MODEL_CAMERA, flat_textures()
     worlds = [small_world(seed, textures) for seed in range(6)]
     batch = WorldBatch.pack(worlds)
     poses = np.concatenate([free_poses(world, 1, 7) for world in worlds])
@@ -156,7 +148,7 @@ def test_every_surface_appears_where_ray_casting_sees_it() -> None:
 
 
 def test_height_and_pitch_move_the_view_as_ray_casting_says() -> None:
-    camera, world = Camera(cx=30.0), small_world(1, flat_textures())
+    camera, world = replace(MODEL_CAMERA, cx=30.0), small_world(1, flat_textures())
     poses = free_poses(world, 4, 2)
     height_m, pitch_px = np.array([0.5, 0.8, 1.15, 1.4]), np.array([0.0, 3.0, -4.5, 11.0])
     batch = WorldBatch.pack([world])
@@ -172,7 +164,7 @@ def test_height_and_pitch_move_the_view_as_ray_casting_says() -> None:
 def test_texels_lie_where_the_mapping_puts_them() -> None:
     # Textures of 24 m keep a texel far wider than a pixel's footprint: level 0 everywhere.
     textures = np.random.default_rng(0).integers(0, 256, (SURFACES, 128, 128, 3)).astype(np.uint8)
-    camera, world = Camera(), small_world(4, textures, size_m=24.0)
+    camera, world = MODEL_CAMERA, small_world(4, textures, size_m=24.0)
     camera = replace(camera, width=160, height=160, fx=500.0, fy=500.0, cx=80.0, cy=80.0)
     poses = free_poses(world, 4, 5)
     images = render(
@@ -186,7 +178,7 @@ def test_texels_lie_where_the_mapping_puts_them() -> None:
 def test_supersampled_pixel_is_the_mean_of_its_rays() -> None:
     world = small_world(2, flat_textures())
     poses = base_pose(free_poses(world, 3, 1))
-    batch, index, camera = WorldBatch.pack([world]), np.zeros(3, int), Camera()
+    batch, index, camera = WorldBatch.pack([world]), np.zeros(3, int), MODEL_CAMERA
     double = replace(camera, width=128, height=128, fx=36.96, fy=47.36, cx=64.0, cy=64.0)
     fine = render(batch, index, poses, double, supersample=1).astype(float)
     mean = fine.reshape(3, 64, 2, 64, 2, 3).mean(axis=(2, 4))  # (B, h, w, 3)
@@ -200,7 +192,7 @@ def test_fine_texture_far_away_fades_to_its_mean() -> None:
     plain = replace(world, textures=np.full_like(textures, 100))
     poses = base_pose(free_poses(world, 4, 3))
     batch = WorldBatch.pack([world, plain])
-    images = [render(batch, np.full(4, i), poses, Camera()).astype(float) for i in (0, 1)]
+    images = [render(batch, np.full(4, i), poses, MODEL_CAMERA).astype(float) for i in (0, 1)]
     assert np.abs(images[0] - images[1]).mean() < 2.0
 
 
@@ -223,17 +215,17 @@ def test_batch_gives_each_pose_the_image_it_has_alone() -> None:
     batch = WorldBatch.pack(worlds)
     index = np.array([2, 0, 1, 2])
     poses = np.concatenate([free_poses(worlds[i], 1, i) for i in index])
-    together = render(batch, index, poses, Camera())
+    together = render(batch, index, poses, MODEL_CAMERA)
     for i, pose, image in zip(index, poses, together, strict=True):
-        alone = render(WorldBatch.pack([worlds[i]]), np.zeros(1, int), pose[None], Camera())
+        alone = render(WorldBatch.pack([worlds[i]]), np.zeros(1, int), pose[None], MODEL_CAMERA)
         assert np.array_equal(alone[0], image)
-    assert np.array_equal(together, render(batch, index, poses, Camera()))
+    assert np.array_equal(together, render(batch, index, poses, MODEL_CAMERA))
 
 
 def test_pose_off_the_grid_sees_a_wall() -> None:
     world = small_world(0, flat_textures())
-    poses = np.array([[-50.0, 3.0, 0.3], [1e6, -1e6, 2.0], [1.0, 4.9, -1.0], [-1.5, 0.75, 0.0]])
-    images = render(WorldBatch.pack([world]), np.zeros(4, int), poses, Camera())
+    poses = np.array([[-50.0, 3.0, 0.3], [1e6, -1e6, 2.9], [1.0, 4.9, -1.0], [-1.5, 0.75, 0.0]])
+    images = render(WorldBatch.pack([world]), np.zeros(4, int), poses, MODEL_CAMERA)
     assert (images[:2].reshape(2, -1, 3).std(axis=1) == 0.0).all()  # (B, h * w, 3)
 
 
@@ -242,7 +234,7 @@ def test_open_grid_edge_looks_like_a_wall_to_the_ceiling() -> None:
     none = np.zeros_like(empty.solid_top_m)
     empty = replace(empty, solid_top_m=none, span_top_m=none, solid_side=none.astype(np.uint16))
     image = render(
-        WorldBatch.pack([empty]), np.zeros(1, int), np.array([[1.0, 2.75, 0.0]]), Camera()
+        WorldBatch.pack([empty]), np.zeros(1, int), np.array([[1.0, 2.75, 0.0]]), MODEL_CAMERA
     )[0]
     expected = np.minimum(empty.textures[0, 0, 0] * empty.surfaces.tint[0] * 0.82, 255)
     assert np.abs(image[31, 30:34] - expected).max() <= 1.0
@@ -251,15 +243,15 @@ def test_open_grid_edge_looks_like_a_wall_to_the_ceiling() -> None:
 def test_world_out_of_range_is_refused() -> None:
     batch = WorldBatch.pack([small_world(0, flat_textures())])
     with pytest.raises(WorldError, match=r"holds worlds 0\.\.0"):
-        render(batch, np.array([1]), np.zeros((1, 3)), Camera())
+        render(batch, np.array([1]), np.zeros((1, 3)), MODEL_CAMERA)
     with pytest.raises(WorldError, match="NaN"):
-        render(batch, np.array([0]), np.full((1, 3), np.nan), Camera())
+        render(batch, np.array([0]), np.full((1, 3), np.nan), MODEL_CAMERA)
 
 
 def test_fisheye_camera_is_refused() -> None:
     batch = WorldBatch.pack([small_world(0, flat_textures())])
     with pytest.raises(CameraError, match="pinhole"):
-        render(batch, np.array([0]), np.zeros((1, 3)), Camera(model="fisheye"))
+        render(batch, np.array([0]), np.zeros((1, 3)), replace(MODEL_CAMERA, model="fisheye"))
 
 
 def test_surface_without_entry_is_refused() -> None:

@@ -34,9 +34,7 @@ def room(seed: int, rows: int = 24, columns: int = 60) -> World:
 def brute_force(world: World, pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """Nearest distance (rays,) to any square the scan can see."""
     seen = world.solid_top_m >= ROBOT.scan_height_m
-    seen |= (world.span_bottom_m <= ROBOT.scan_height_m) & (
-        world.span_top_m >= ROBOT.scan_height_m
-    )
+    seen |= (world.span_bottom_m <= ROBOT.scan_height_m) & (world.span_top_m >= ROBOT.scan_height_m)
     row, column = np.nonzero(seen)
     low = np.array(world.origin_m) + np.column_stack([column, row]) * CELL_M  # (K, 2)
     ahead = np.array([np.cos(pose[2]), np.sin(pose[2])]) * ROBOT.scan_x_m

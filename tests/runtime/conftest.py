@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
+from onnx import TensorProto, helper, numpy_helper
+
 from cbe import signature
 from cbe_runtime.networks import Networks
 from cbe_runtime.route import Precision, Route, Segment
-from onnx import TensorProto, helper, numpy_helper
 
 ELEMENTS = {"tensor(float)": TensorProto.FLOAT, "tensor(uint8)": TensorProto.UINT8}
 STATE = 8
@@ -78,7 +79,9 @@ def encoder_nodes(rng):
 
 
 def attractor_nodes(rng):
-    weights = {"mix": rng.normal(size=(signature.FEATURES[0], signature.ATTRACTOR_SIZE)).astype(np.float32)}
+    weights = {
+        "mix": rng.normal(size=(signature.FEATURES[0], signature.ATTRACTOR_SIZE)).astype(np.float32)
+    }
     nodes = [
         helper.make_node("ReduceMean", ["features"], ["mean"], axes=[2, 3], keepdims=0),
         helper.make_node("MatMul", ["mean", "mix"], ["mixed"]),
@@ -111,13 +114,15 @@ def generator_nodes(ticks_to_goal, waypoint_m):
     return nodes, weights
 
 
-def make_model(folder, ticks_to_goal=20, waypoint_m=(0.5, 0.0), **metadata):
+def make_model(folder, ticks_to_goal=19.5, waypoint_m=(0.5, 0.0), **metadata):
     """Write a tiny model whose progress rises by 1/ticks_to_goal a tick."""
     rng = np.random.default_rng(0)
     folder.mkdir(parents=True, exist_ok=True)
     write(folder, signature.encoder(STATE), *encoder_nodes(rng), **metadata)
     write(folder, signature.attractor(), *attractor_nodes(rng), **metadata)
-    write(folder, signature.generator(STATE), *generator_nodes(ticks_to_goal, waypoint_m), **metadata)
+    write(
+        folder, signature.generator(STATE), *generator_nodes(ticks_to_goal, waypoint_m), **metadata
+    )
     return folder
 
 

@@ -1,11 +1,12 @@
 import numpy as np
 import pytest
-from cbe.errors import RouteError
-from cbe.signature import ATTRACTOR_SIZE, EMBEDDING_SIZE
-from cbe_runtime.route import AttractorPrecision, EmbeddingPrecision, Precision, Route, Segment
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+
+from cbe.errors import RouteError
+from cbe.signature import ATTRACTOR_SIZE, EMBEDDING_SIZE
+from cbe_runtime.route import AttractorPrecision, EmbeddingPrecision, Precision, Route, Segment
 
 UNIT = hnp.arrays(np.float32, ATTRACTOR_SIZE, elements=st.floats(0, 1, width=32))
 FLOATS = hnp.arrays(np.float32, EMBEDDING_SIZE, elements=st.floats(-100, 100, width=32))
@@ -57,7 +58,7 @@ def test_other_model_is_refused_with_both_ids(route, networks, model_writer, tmp
 
     route.require_model(networks)
     other = Networks.load(model_writer(tmp_path, **{"cbe.model_id": "ffffffffffffffff"}))
-    with pytest.raises(RouteError, match="00112233445566aa.*ffffffffffffffff.*re-teach"):
+    with pytest.raises(RouteError, match=r"00112233445566aa.*ffffffffffffffff.*re-teach"):
         route.require_model(other)
 
 

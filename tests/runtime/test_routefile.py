@@ -1,17 +1,18 @@
+import hashlib
 import os
 from dataclasses import replace
 from pathlib import Path
 
-import hashlib
 import msgpack
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
 from cbe.camera import CameraModel
 from cbe.errors import RouteError
 from cbe_runtime import routefile
 from cbe_runtime.route import AttractorPrecision, EmbeddingPrecision, Precision
-from hypothesis import given
-from hypothesis import strategies as st
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 
@@ -34,11 +35,13 @@ def opened(route):
 
 
 def test_route_returns_as_it_was_saved(route, tmp_path):
-    route = replace(route, camera=CameraModel(640, 480, 312.25, 310.1, 320, 240, "fisheye", (0.1,) * 4))
+    route = replace(
+        route, camera=CameraModel(640, 480, 312.25, 310.1, 320, 240, "fisheye", (0.1,) * 4)
+    )
     size = routefile.save(route, tmp_path / "r.msgpack")
     assert (tmp_path / "r.msgpack").stat().st_size == size
     assert routefile.load(tmp_path / "r.msgpack") == route
-    assert os.listdir(tmp_path) == ["r.msgpack"]
+    assert list(tmp_path.iterdir()) == [tmp_path / "r.msgpack"]
 
 
 def test_golden_route_of_version_1_still_loads():
@@ -108,7 +111,7 @@ def test_body_out_of_range_is_refused(route, change):
 
 
 def test_later_version_says_to_upgrade(route):
-    with pytest.raises(RouteError, match="version 2.*upgrade"):
+    with pytest.raises(RouteError, match=r"version 2.*upgrade"):
         routefile.parse(sealed(opened(route), version=2))
 
 
@@ -140,4 +143,4 @@ def test_failed_save_leaves_the_old_route(route, tmp_path, monkeypatch):
     with pytest.raises(RouteError, match="No space"):
         routefile.save(replace(route, tags={"name": "new"}), path)
     assert routefile.load(path) == route
-    assert os.listdir(tmp_path) == ["r.msgpack"]
+    assert list(tmp_path.iterdir()) == [tmp_path / "r.msgpack"]

@@ -43,10 +43,13 @@ def load_networks(folder: Path) -> BehaviorNetworks:
 class Learner:
     """What changes while training: networks, heads, optimiser, moving average, iteration."""
 
-    def __init__(self, config: TrainConfig, device: torch.device) -> None:
+    def __init__(
+        self, config: TrainConfig, device: torch.device, *, bf16: bool = False
+    ) -> None:
         torch.manual_seed(config.seed)
         self.config = config
         self.device = device
+        self.bf16 = bf16
         self.networks = BehaviorNetworks(config.network).to(device)
         self.heads = AuxiliaryHeads(config.network).to(device)
         self.average = BehaviorNetworks(config.network).to(device)

@@ -32,12 +32,18 @@ def main() -> int:
     parser.add_argument(
         "--workers", type=int, default=0, help="processes (default: one a core, one with a GPU)"
     )
+    parser.add_argument(
+        "--bf16",
+        action=argparse.BooleanOptionalAction,
+        help="bfloat16 arithmetic (default: with a GPU; most CPUs only emulate it)",
+    )
     arguments = parser.parse_args()
     device = torch.device(arguments.device)
     workers = arguments.workers or (1 if device.type != "cpu" else os.cpu_count() or 1)
     config = replace(TrainConfig(), seed=arguments.seed, worlds=arguments.worlds)
+    bf16 = device.type == "cuda" if arguments.bf16 is None else arguments.bf16
     work = partial(
-        _work, config, arguments.run, arguments.hours, arguments.decay_hours, device
+        _work, config, arguments.run, arguments.hours, arguments.decay_hours, device, bf16
     )
     try:
         team.run(work, workers)
@@ -53,8 +59,9 @@ def _work(
     hours: float,
     decay_hours: float,
     device: torch.device,
+    bf16: bool,
     member: team.Team,
 ) -> None:
     level = logging.INFO if member.rank == 0 else logging.WARNING
     logging.basicConfig(level=level, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
-    train(config, folder, hours, device, member, decay_hours)
+    train(config, folder, hours, device, member, decay_hours=decay_hours, bf16=bf16)

@@ -24,7 +24,7 @@ class TrainConfig:
 
     seed: int = 0
     worlds: int = 100
-    drives_per_world: int = 40
+    drives_per_world: int = 25
     demonstrations: int = 48  # behaviors shown in one iteration
     repeats: int = 2  # rollouts of each, from different starts
     epochs: int = 2  # times each rollout is trained on
@@ -34,8 +34,8 @@ class TrainConfig:
     weight_decay: float = 1e-4
     clip_norm: float = 1.0
     average_decay: float = 0.998  # of the exported moving average of the weights
-    cloning_iterations: int = 110  # expert at the wheel, short behaviors
-    annealing_iterations: int = 130  # the expert's share falls from 1 to 0
+    cloning_iterations: int = 120  # expert at the wheel, short behaviors
+    annealing_iterations: int = 120  # the expert's share falls from 1 to 0
     expert_episodes: float = 0.2  # always driven by the (noisy) expert
     wrong_episodes: float = 0.06  # shown another behavior's memory
     joining_episodes: float = 0.1  # start in the middle of the behavior

@@ -38,8 +38,7 @@ class Drives:
         """
         worlds = [generate(seed) for seed in seeds]
         logger.info("generated %d worlds", len(worlds))
-        key = hashlib.sha256(f"{seeds} {per_world}".encode()).hexdigest()[:12]
-        path = cache / f"drives-{key}.npz"
+        path = cache / cache_name(worlds, per_world)
         if path.exists():
             stored = np.load(path)
             world, flat, length = stored["world"], stored["poses"], stored["length"]
@@ -51,6 +50,14 @@ class Drives:
             np.savez_compressed(path, world=world, poses=np.concatenate(poses), length=length)
         logger.info("%d drives, %.0f steps on average", len(poses), np.mean([len(p) for p in poses]))
         return cls(WorldBatch.pack(worlds), Clearance(worlds), world, list(poses))
+
+
+def cache_name(worlds: list[World], per_world: int) -> str:
+    """File name of cached drives: it changes with whatever the robot could run into."""
+    digest = hashlib.sha256(str(per_world).encode())
+    for world in worlds:
+        digest.update(world.blocked.tobytes())
+    return f"drives-{digest.hexdigest()[:12]}.npz"
 
 
 def _drive(

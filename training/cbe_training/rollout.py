@@ -22,6 +22,7 @@ from cbe_training.policy import Policy, memorise
 
 FRAMES_PAST_GOAL = 3
 FRAMES_OFF_ROUTE = 4
+ALIASED = 0.3  # share of behaviors rendered without antialiasing, as other renderers do
 REACHED = 0.985  # share of the path
 NOISE_RAD = (0.0, 0.0, 0.15, 0.4)  # of the expert's waypoint, so that it has errors to correct
 
@@ -36,6 +37,7 @@ class Behaviors:
     images: NDArray[np.uint8]  # (D, T, 64, 64, 3)
     frame_poses: NDArray[np.float64]  # (D, T, 3)
     gap: int  # steps between frames
+    supersample: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,9 +75,12 @@ def show(
     frame_poses = paths.poses[:, ::gap]
     world = drives.world[chosen]
     every = np.repeat(np.arange(count), frames)
-    images = _photograph(drives, world[every], frame_poses.reshape(-1, 3), cameras.take(every), rng)
+    supersample = 1 if rng.random() < ALIASED else 2
+    images = _photograph(
+        drives, world[every], frame_poses.reshape(-1, 3), cameras.take(every), supersample, rng
+    )
     images = images.reshape(count, frames, *images.shape[1:])
-    return Behaviors(paths, world, cameras, images, frame_poses, gap)
+    return Behaviors(paths, world, cameras, images, frame_poses, gap, supersample)
 
 
 def roll_out(
@@ -129,7 +134,9 @@ def roll_out(
         if not len(rows):
             break
         poses = vehicle.poses[rows]
-        images = _photograph(drives, world[rows], poses, cameras.take(rows), rng)
+        images = _photograph(
+            drives, world[rows], poses, cameras.take(rows), behaviors.supersample, rng
+        )
         labels = track.label(paths.take(rows), poses, last[rows], config.lookahead_m)
         last[rows] = labels.closest
         out.images[rows, tick], out.poses[rows, tick] = images, poses
@@ -185,15 +192,16 @@ def _photograph(
     world: NDArray[np.int64],
     poses: NDArray[np.float64],
     cameras: Appearance,
+    supersample: int,
     rng: np.random.Generator,
 ) -> NDArray[np.uint8]:
-    """Images (B, 64, 64, 3) through their cameras; half of the calls without antialiasing."""
+    """Images (B, 64, 64, 3) of B poses through their cameras."""
     images = render(
         drives.batch,
         world,
         poses,
         MODEL_CAMERA,
-        supersample=2,
+        supersample=supersample,
         height_m=cameras.height_m,
         pitch_px=cameras.pitch_px,
     )

@@ -4,7 +4,6 @@ Every random draw is derived from (seed, iteration), so a run resumed at an iter
 on as if it had never stopped.
 """
 
-import csv
 import ctypes
 import logging
 import sys
@@ -19,6 +18,7 @@ from cbe_hil_sim.generate import TRAIN_SEEDS, VALIDATION_SEEDS
 from cbe_training import losses
 from cbe_training.checkpoint import Learner
 from cbe_training.config import TrainConfig
+from cbe_training.curve import STEPS, Curve
 from cbe_training.drives import Drives
 from cbe_training.networks import BehaviorNetworks
 from cbe_training.rollout import Rollouts, roll_out, show
@@ -26,7 +26,8 @@ from cbe_training.team import Team
 
 GAPS = (1, 2, 2, 2, 3)  # steps between frames: mostly the runtime's, some slower and faster
 VALIDATION_WORLDS, VALIDATION_DRIVES = 10, 20
-VALIDATION_STEPS, VALIDATION_BEHAVIORS = (64, 128), 48
+VALIDATION_BEHAVIORS = 48
+SAVE_EVERY_S = 240.0
 
 logger = logging.getLogger(__name__)
 
@@ -37,14 +38,16 @@ def train(
     hours: float,
     device: torch.device,
     team: Team,
+    *,
     decay_hours: float = 0.0,
+    bf16: bool = False,
 ) -> None:
     """Train for `hours` more, the learning rate falling to nothing over the last `decay_hours`.
 
     Every worker of the team calls this with the same arguments.
     """
     _keep_freed_memory()
-    learner = Learner(config, device)
+    learner = Learner(config, device, bf16=bf16)
     if (folder / "state.json").exists():
         learner.load(folder)
         logger.info("resumed at iteration %d", learner.iteration)
@@ -55,6 +58,7 @@ def train(
     unseen = Drives.build(VALIDATION_SEEDS[:VALIDATION_WORLDS], VALIDATION_DRIVES, cache)
     start, saved = time.monotonic(), time.monotonic()
     before = learner.seconds
+    curve = Curve(folder) if team.rank == 0 else None
     while (elapsed := team.latest(time.monotonic() - start)) < hours * 3600.0:
         left = hours * 3600.0 - elapsed
         decay = min(1.0, left / (decay_hours * 3600.0)) if decay_hours > 0.0 else 1.0
@@ -63,13 +67,18 @@ def train(
         learner.seconds = before + elapsed
         if learner.iteration % config.validation_every == 0:
             row |= validate(learner.average, unseen, config, team)
-        if team.rank == 0:
-            _log(folder, learner, row)
-            if time.monotonic() - saved > 240.0:
+        if curve is not None:
+            counts = {"iteration": learner.iteration, "sequences": learner.sequences}
+            row = {**counts, "hours": learner.seconds / 3600.0, **row}
+            curve.add(row)
+            logger.info("%s", " ".join(f"{name}={value:.4g}" for name, value in row.items()))
+            if time.monotonic() - saved > SAVE_EVERY_S:
                 learner.save(folder)
+                curve.draw()
                 saved = time.monotonic()
-    if team.rank == 0:
+    if curve is not None:
         learner.save(folder)
+        curve.draw()
 
 
 def iterate(learner: Learner, drives: Drives, decay: float, team: Team) -> dict[str, float]:
@@ -94,7 +103,8 @@ def iterate(learner: Learner, drives: Drives, decay: float, team: Team) -> dict[
             warm = min(1.0, (learner.updates + 1) / config.warmup_updates)
             for group in learner.optimizer.param_groups:
                 group["lr"] = config.learning_rate * warm * decay
-            loss, parts = losses.compute(learner.networks, learner.heads, batch, config.loss)
+            with torch.autocast(learner.device.type, torch.bfloat16, enabled=learner.bf16):
+                loss, parts = losses.compute(learner.networks, learner.heads, batch, config.loss)
             learner.optimizer.zero_grad(set_to_none=True)
             loss.backward()
             team.average_gradients(learner.parameters)
@@ -119,7 +129,7 @@ def validate(
 ) -> dict[str, float]:
     """Success of the networks alone in unseen worlds, each worker driving its share."""
     row: dict[str, float] = {}
-    for steps in VALIDATION_STEPS:
+    for steps in STEPS:
         rng = np.random.default_rng([7, steps, team.rank])
         behaviors = show(drives, VALIDATION_BEHAVIORS // team.size, steps // 2 + 1, 2, rng)
         done = roll_out(networks, drives, behaviors, config, rng, expert_share=0.0, training=False)
@@ -135,38 +145,6 @@ def _minibatches(
     """Repetitions of a behavior stay together, so that its demonstration is encoded once."""
     groups = rng.permutation(rollouts.driven.max() + 1).reshape(-1, behaviors)
     return [np.flatnonzero(np.isin(rollouts.driven, group)) for group in groups]
-
-
-def _log(folder: Path, learner: Learner, row: dict[str, float]) -> None:
-    """Append to log.csv, and to TensorBoard's scalars where it is installed."""
-    folder.mkdir(parents=True, exist_ok=True)
-    row = {
-        "iteration": learner.iteration,
-        "hours": learner.seconds / 3600.0,
-        "sequences": learner.sequences,
-        **row,
-    }
-    names = [*FIELDS, *VALIDATION_FIELDS]
-    path = folder / "log.csv"
-    new = not path.exists()
-    with path.open("a", newline="") as file:
-        writer = csv.DictWriter(file, names, extrasaction="ignore", restval="")
-        if new:
-            writer.writeheader()
-        writer.writerow({k: round(v, 5) if isinstance(v, float) else v for k, v in row.items()})
-    logger.info(
-        "%s", " ".join(f"{k}={v:.3f}" if isinstance(v, float) else f"{k}={v}" for k, v in row.items())
-    )
-
-
-FIELDS = (
-    "iteration", "hours", "sequences", "waypoint", "progress", "on_route", "motion",
-    "displacement", "shape", "relation", "norm", "frames", "gap", "expert_share", "collided",
-    "rollout_s", "update_s",
-)  # fmt: skip
-VALIDATION_FIELDS = tuple(
-    f"{name}_{steps}" for steps in VALIDATION_STEPS for name in ("success", "collided", "false_arrival")
-)
 
 
 def _keep_freed_memory() -> None:

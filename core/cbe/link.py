@@ -1,0 +1,239 @@
+"""The Zenoh link: latest-value subscribers, publishers that never block, calls and liveliness."""
+
+from __future__ import annotations
+
+import logging
+import struct
+import time
+import uuid
+from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
+
+import msgspec
+import zenoh
+
+from cbe.errors import CbeError, LinkError, MessageError
+from cbe.inbox import Latest, Stream
+from cbe.topics import KeyStyle, key_expression, subscription
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from cbe.codec import Message
+    from cbe.linkconfig import LinkConfig
+    from cbe.topics import M, Topic
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
+JsonObject = dict[str, Any]
+
+_ATTACHMENT = struct.Struct("<qqB16s")
+"""rmw_zenoh's: sequence number, time sent in ns, length of the writer's id, that id."""
+_ID_SIZE = 16
+
+
+class Link:
+    """A session on Zenoh, closed by `close` or at the end of `with`.
+
+    It never hears its own messages. Methods raise LinkError once it is closed.
+    """
+
+    def __init__(self, session: zenoh.Session, config: LinkConfig) -> None:
+        self._session = session
+        self._declared: list[object] = []  # what Python drops, Zenoh undeclares
+        self.config = config
+
+    @classmethod
+    def open(cls, config: LinkConfig) -> Link:
+        """Connect and listen; raises LinkError within `open_timeout_s` where that fails."""
+        settings = zenoh.Config()
+        for key, value in config.zenoh_json5().items():
+            settings.insert_json5(key, value)
+        try:
+            session = zenoh.open(settings)
+        except zenoh.ZError as error:
+            raise LinkError(_why_not_open(config, error)) from error
+        return cls(session, config)
+
+    def close(self) -> None:
+        """Undeclare everything and disconnect; again does nothing."""
+        if not self._session.is_closed():
+            self._session.close()  # type: ignore[no-untyped-call]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def latest(self, topic: Topic[M]) -> Latest[M]:
+        """A slot with the newest message of a topic."""
+        inbox = Latest(topic.message.from_cdr)
+        self._subscribe(self._subscription(topic), inbox)
+        return inbox
+
+    def stream(self, topic: Topic[Any], capacity: int = 256) -> Stream:
+        """Every message of a topic as CDR bytes, for a recorder."""
+        inbox = Stream(capacity)
+        self._subscribe(self._subscription(topic), inbox)
+        return inbox
+
+    def publisher(self, topic: Topic[M]) -> Publisher[M]:
+        """A publisher of a topic's messages."""
+        style = self.config.style
+        key = key_expression(topic, style, self.config.domain)
+        return Publisher(self._declare(key), _cdr, attach=style is KeyStyle.RMW_ZENOH)
+
+    def latest_json(self, name: str) -> Latest[JsonObject]:
+        """A slot with the newest JSON object under this robot's own key, such as "status"."""
+        inbox = Latest(_from_json)
+        self._subscribe(self.config.own_key(name), inbox)
+        return inbox
+
+    def json_publisher(self, name: str) -> Publisher[JsonObject]:
+        """A publisher of JSON objects under this robot's own key."""
+        return Publisher(self._declare(self.config.own_key(name)), msgspec.json.encode)
+
+    def serve(self, name: str, handler: Callable[[JsonObject], JsonObject]) -> None:
+        """Answer calls to `rpc/<name>`; an exception of the handler is sent as an error reply.
+
+        The handler runs in a thread of its own, one call at a time.
+        """
+        key = self.config.own_key(f"rpc/{name}")
+
+        def answer(query: zenoh.Query) -> None:
+            with query:
+                payload = query.payload
+                try:
+                    request = _from_json(payload.to_bytes()) if payload else {}
+                    query.reply(key, msgspec.json.encode(handler(request)))
+                except CbeError as error:
+                    query.reply_err(str(error).encode())
+                except Exception as error:  # unanswered, the caller would wait in vain
+                    logger.exception("rpc %s failed", name)
+                    query.reply_err(f"{type(error).__name__}: {error}".encode())
+
+        self._declared.append(self._guarded(self._session.declare_queryable, key, answer))
+
+    def call(
+        self, name: str, request: JsonObject | None = None, timeout_s: float = 2.0
+    ) -> JsonObject:
+        """The reply to `rpc/<name>`; raises LinkError for an error reply, or for none in time."""
+        key = self.config.own_key(f"rpc/{name}")
+        replies = self._guarded(
+            self._session.get, key, payload=msgspec.json.encode(request or {}), timeout=timeout_s
+        )
+        for reply in replies:
+            if reply.ok is not None:
+                return _from_json(reply.ok.payload.to_bytes())
+            reason = reply.err.payload.to_bytes().decode(errors="replace")
+            if reason == "Timeout":
+                raise LinkError(f"no answer from {key} within {timeout_s:g} s")
+            raise LinkError(f"{key} answered: {reason}")
+        raise LinkError(f"nobody answers {key}; is the process that serves it running?")
+
+    def declare_alive(self, process: str) -> None:
+        """Show others that this process lives, until the link closes or breaks."""
+        key = self.config.own_key(f"alive/{process}")
+        self._declared.append(self._guarded(self._session.liveliness().declare_token, key))
+
+    def alive(self, process: str, timeout_s: float = 1.0) -> bool:
+        """Whether a process of that name lives. One that hangs looks alive for some seconds."""
+        key = self.config.own_key(f"alive/{process}")
+        replies = self._guarded(self._session.liveliness().get, key, timeout=timeout_s)
+        return any(reply.ok is not None for reply in replies)
+
+    def watch_alive(self, process: str, changed: Callable[[bool], None]) -> None:
+        """Call `changed`, from a thread of the link, when a process appears or goes.
+
+        One that already lives is reported at once.
+        """
+
+        def on_sample(sample: zenoh.Sample) -> None:
+            changed(sample.kind == zenoh.SampleKind.PUT)
+
+        key = self.config.own_key(f"alive/{process}")
+        declare = self._session.liveliness().declare_subscriber
+        self._declared.append(self._guarded(declare, key, on_sample, history=True))
+
+    def _subscription(self, topic: Topic[Any]) -> str:
+        return subscription(topic, self.config.style, self.config.domain)
+
+    def _subscribe(self, key: str, inbox: Latest[Any] | Stream) -> None:
+        def on_sample(sample: zenoh.Sample) -> None:
+            if sample.kind == zenoh.SampleKind.PUT:
+                inbox.store(sample.payload.to_bytes(), _sequence(sample.attachment))
+
+        origin = zenoh.Locality.REMOTE
+        declare = self._session.declare_subscriber
+        self._declared.append(self._guarded(declare, key, on_sample, allowed_origin=origin))
+
+    def _declare(self, key: str) -> zenoh.Publisher:
+        publisher: zenoh.Publisher = self._guarded(
+            self._session.declare_publisher,
+            key,
+            # BLOCK would stall a put for 5 s on a subscriber that has stopped.
+            congestion_control=zenoh.CongestionControl.DROP,
+            # Sent at once, not after the next batch.
+            express=True,
+        )
+        return publisher
+
+    def _guarded(self, method: Callable[..., Any], key: str, *values: Any, **options: Any) -> Any:
+        try:
+            return method(key, *values, **options)
+        except zenoh.ZError as error:
+            raise LinkError(f"the link cannot use {key}: {error}") from error
+
+
+class Publisher(Generic[T]):
+    """Publishes under one key; drops a message rather than wait for a slow receiver."""
+
+    def __init__(
+        self, publisher: zenoh.Publisher, encode: Callable[[T], bytes], attach: bool = False
+    ) -> None:
+        self._publisher = publisher
+        self._encode = encode
+        self._id = uuid.uuid4().bytes if attach else None
+        self._sequence = 0
+
+    def put(self, message: T) -> None:
+        """Send; raises MessageError for a value that does not fit, LinkError on a closed link."""
+        attachment = None
+        if self._id is not None:
+            self._sequence += 1
+            attachment = _ATTACHMENT.pack(self._sequence, time.time_ns(), _ID_SIZE, self._id)
+        try:
+            self._publisher.put(self._encode(message), attachment=attachment)
+        except zenoh.ZError as error:
+            raise LinkError(f"cannot publish {self._publisher.key_expr}: {error}") from error
+
+
+def _cdr(message: Message) -> bytes:
+    return message.to_cdr()
+
+
+def _from_json(payload: bytes) -> JsonObject:
+    try:
+        return msgspec.json.decode(payload, type=JsonObject)
+    except (msgspec.MsgspecError, RecursionError) as error:
+        raise MessageError(f"{len(payload)} bytes are no JSON object: {error}") from error
+
+
+def _sequence(attachment: zenoh.ZBytes | None) -> int | None:
+    """The sender's sequence number; bare topics carry none."""
+    if attachment is None or len(attachment) != _ATTACHMENT.size:
+        return None
+    sequence: int = _ATTACHMENT.unpack(attachment.to_bytes())[0]
+    return sequence
+
+
+def _why_not_open(config: LinkConfig, error: Exception) -> str:
+    endpoints = ", ".join((*config.connect, *config.listen))
+    reason = str(error).split(" at /")[0]  # the rest names a file of the library
+    if config.connect and "connect" in reason:
+        return (
+            f"no answer from {', '.join(config.connect)} within {config.open_timeout_s:g} s; "
+            "start the robot or simulator that listens there, or name another endpoint"
+        )
+    return f"cannot open the link on {endpoints}: {reason}"

@@ -1,0 +1,137 @@
+"""Short manoeuvres, two arcs each, scored against the scan: which way round an obstacle to go.
+
+Repulsion alone, and a single arc too, drive into dead ends beside an obstacle; a second arc
+shows early enough whether the car, which cannot reverse, will get out again behind it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cbe.robot import Robot
+
+Floats = NDArray[np.floating]
+
+SPACING_M = 0.12  # between the checked places of a manoeuvre
+FIRST_SAMPLES, SECOND_SAMPLES = 3, 7
+SAMPLES = FIRST_SAMPLES + SECOND_SAMPLES
+_OPEN_M = 10.0  # clearance and free length where nothing is near
+
+
+@dataclass(frozen=True, slots=True)
+class ManoeuvreGains:
+    """What a manoeuvre may cost; curvatures count in parts of full lock."""
+
+    first_arcs: int = 11
+    second_arcs: int = 7
+    horizon_per_m: float = 2.0  # length that counts, per metre to the waypoint
+    wanted_clearance_m: float = 0.2  # between body and obstacle
+    least_clearance_m: float = 0.03
+    miss_weight_per_m: float = 1.0  # nearest distance to the waypoint
+    clearance_weight: float = 2.0
+    blocked_weight: float = 4.0
+    toward_weight: float = 0.3  # first arc's change from the waypoint's curvature
+    change_weight: float = 0.15  # first arc's change from the present curvature
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Chosen manoeuvres of B robots: first curvature, least clearance, free length (B,)."""
+
+    curvature_per_m: NDArray[np.float64]
+    clearance_m: Floats
+    free_m: Floats
+
+
+class Manoeuvres:
+    """A fixed tree of manoeuvres in base_link; besides it the one arc to the waypoint."""
+
+    def __init__(self, robot: Robot, gains: ManoeuvreGains) -> None:
+        """Lay out the tree within the robot's steering limit."""
+        self._robot, self._gains = robot, gains
+        widest = robot.max_curvature_per_m
+        first = np.linspace(-widest, widest, gains.first_arcs)
+        second = np.linspace(-widest, widest, gains.second_arcs)
+        self._first = np.repeat(first, gains.second_arcs)  # (T,)
+        lead_x, lead_y = _arc(first, FIRST_SAMPLES)  # (F, 3)
+        tail_x, tail_y = _arc(second, SECOND_SAMPLES)  # (G, 7)
+        turned = (first * SPACING_M * FIRST_SAMPLES)[:, None, None]
+        x = lead_x[:, -1, None, None] + np.cos(turned) * tail_x - np.sin(turned) * tail_y
+        y = lead_y[:, -1, None, None] + np.sin(turned) * tail_x + np.cos(turned) * tail_y
+        # (2, F * 3 + F * G * 7): the leads, each shared by G manoeuvres, then the tails.
+        self._tree = np.stack(
+            [np.append(lead_x, x), np.append(lead_y, y)]
+        ).astype(np.float32)
+        manoeuvre = np.arange(len(self._first))
+        begin = manoeuvre[:, None] // gains.second_arcs * FIRST_SAMPLES + np.arange(FIRST_SAMPLES)
+        end = lead_x.size + manoeuvre[:, None] * SECOND_SAMPLES + np.arange(SECOND_SAMPLES)
+        direct = self._tree.shape[1] + np.arange(SAMPLES)  # the arc to the waypoint comes last
+        rows = np.concatenate([np.concatenate([begin, end], axis=1), direct[None]])
+        self._samples = np.ascontiguousarray(rows.T)  # (10, T + 1) places of each manoeuvre
+        self._travelled = (SPACING_M * np.arange(1, SAMPLES + 1)).astype(np.float32)
+
+    def choose(
+        self,
+        toward_per_m: NDArray[np.float64],
+        present_per_m: NDArray[np.float64],
+        waypoint_m: NDArray[np.float64],
+        points_m: NDArray[np.float32],
+    ) -> Choice:
+        """Cheapest manoeuvre of each of B robots.
+
+        `toward_per_m` (B,) leads to `waypoint_m` (B, 2), `present_per_m` (B,) is being steered,
+        `points_m` (B, P, 2) is the scan, all in base_link.
+        """
+        gains = self._gains
+        batch, tree = len(toward_per_m), self._tree.shape[1]
+        places = np.empty((batch, 2, tree + SAMPLES), np.float32)
+        places[:, :, :tree] = self._tree
+        places[:, 0, tree:], places[:, 1, tree:] = _arc(toward_per_m, SAMPLES)
+        sample = _nearest_m(places, points_m)[:, self._samples]  # (B, 10, T + 1)
+        sample -= np.float32(self._robot.body_radius_m)
+        off = places - waypoint_m.astype(np.float32)[..., None]
+        off *= off
+        miss = np.sqrt((off[:, 0] + off[:, 1])[:, self._samples].min(axis=1))  # (B, T + 1)
+
+        distance = np.hypot(waypoint_m[:, 0], waypoint_m[:, 1]).astype(np.float32)
+        horizon = np.minimum(
+            gains.horizon_per_m * distance + np.float32(SPACING_M), self._travelled[-1]
+        )[:, None]
+        minded = self._travelled <= horizon  # (B, 10)
+        sample[~minded] = _OPEN_M
+        clearance = sample.min(axis=1)  # (B, T + 1)
+        first_hit = (sample < gains.least_clearance_m).argmax(axis=1)
+        hit = clearance < gains.least_clearance_m
+        free = np.where(hit, SPACING_M * first_hit, _OPEN_M)
+
+        first = np.empty((batch, len(self._first) + 1))  # (B, T + 1)
+        first[:, :-1], first[:, -1] = self._first, toward_per_m
+        short = 1.0 - clearance / gains.wanted_clearance_m
+        short = np.minimum(np.maximum(short, 0.0), 1.5)
+        blocked = np.maximum(1.0 - free / horizon, 0.0)
+        change = gains.toward_weight * np.abs(first - toward_per_m[:, None])
+        change += gains.change_weight * np.abs(first - present_per_m[:, None])
+        cost = change / self._robot.max_curvature_per_m + gains.miss_weight_per_m * miss
+        cost += gains.clearance_weight * short * short + gains.blocked_weight * blocked
+        best = np.arange(batch), cost.argmin(axis=1)
+        return Choice(first[best], clearance[best], free[best])
+
+
+def _arc(
+    curvature_per_m: NDArray[np.float64], count: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Places x, y (N, count) each `SPACING_M` along arcs (N,) that leave the origin forward."""
+    curvature = (curvature_per_m + (np.abs(curvature_per_m) < 1e-6) * 2e-6)[:, None]
+    angle = curvature * (SPACING_M * np.arange(1, count + 1))
+    return np.sin(angle) / curvature, (1.0 - np.cos(angle)) / curvature
+
+
+def _nearest_m(places: NDArray[np.float32], points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Distance (B, N) from places (B, 2, N) to the nearest of points (B, P, 2)."""
+    # |q - p|^2 = |q|^2 + (|p|^2 - 2 p q): one product and one minimum over few, long rows.
+    x, y = points[..., 0], points[..., 1]
+    mixed = points @ (np.float32(-2.0) * places)  # (B, P, N)
+    mixed += (x * x + y * y)[..., None]
+    x, y = places[:, 0], places[:, 1]
+    return np.asarray(np.sqrt(np.maximum(mixed.min(axis=1) + (x * x + y * y), 0.0)))

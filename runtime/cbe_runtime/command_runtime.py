@@ -1,0 +1,128 @@
+"""`cbe-runtime`: repeats a route on a robot or a simulator."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import signal
+from pathlib import Path
+from threading import Event
+
+from cbe.errors import ConfigError
+from cbe.link import Link
+from cbe.robot import Robot
+from cbe_runtime import options as shared
+from cbe_runtime import routefile
+from cbe_runtime.follower import Follower, FollowerConfig
+from cbe_runtime.loop import Loop, LoopConfig
+from cbe_runtime.networks import Networks
+from cbe_runtime.sensors import Sensors
+from cbe_runtime.view import View
+
+logger = logging.getLogger(__name__)
+
+DESCRIPTION = "Repeat a taught route: camera and scan in, velocity commands out, at 10 Hz."
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Every option explains itself in --help."""
+    parser.add_argument("--memory", type=Path, metavar="ROUTE", help="the route (*.msgpack)")
+    parser.add_argument(
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="TOML file: these options by name (memory = ..., key_style = ..., connect = [...]), "
+        "a table [camera] and a table [follower]; the command line wins",
+    )
+    shared.add_model(parser)
+    shared.add_camera(parser)
+    shared.add_link(parser)
+    parser.add_argument(
+        "--clock",
+        choices=("wall", "sim"),
+        default="wall",
+        help="tick every 0.1 s (wall, default), or once for every stamped frame of a simulator "
+        "(sim); watchdogs stay on wall time",
+    )
+    parser.add_argument("--lockstep", action="store_true", help="the same as --clock sim")
+    parser.add_argument(
+        "--twist", action="store_true", help="publish cmd_vel as Twist instead of TwistStamped"
+    )
+    parser.add_argument(
+        "--wait", action="store_true", help="stay IDLE until the rpc start, instead of starting"
+    )
+    parser.add_argument(
+        "--exit-when-done",
+        action="store_true",
+        help="exit with 0 once ARRIVED and standing, with 3 once STOPPED for --patience seconds",
+    )
+    parser.add_argument(
+        "--patience", type=float, default=5.0, metavar="S", help="see --exit-when-done (default 5)"
+    )
+
+
+def parse(parser: argparse.ArgumentParser, tokens: list[str]) -> argparse.Namespace:
+    """Options of the command line over those of --config over the defaults."""
+    options = parser.parse_args(tokens)
+    tables = {}
+    if options.config is not None:
+        tables = shared.read_toml(options.config)
+        stored = shared.arguments_of(tables, options.config)
+        # A list on the command line replaces the file's instead of growing it.
+        given = {token.split("=")[0] for token in tokens}
+        stored = [each for each in stored if each.split("=")[0] not in given]
+        options = parser.parse_args([*stored, *tokens])
+    options.follower = tables.get("follower", {})
+    options.camera_table = tables.get("camera")
+    return options
+
+
+def run(options: argparse.Namespace) -> int:
+    """Load and check everything, then drive until told to exit.
+
+    Raises:
+        CbeError: route, model, camera, link or an option is refused.
+    """
+    if options.memory is None:
+        raise ConfigError("no route given; name one with --memory route.msgpack")
+    camera = shared.read_camera(options.camera)
+    follower_config = FollowerConfig()
+    if options.config is not None:
+        follower_config = shared.follower_config(options.follower, options.config)
+        if camera is None and options.camera_table is not None:
+            camera = shared.camera_of(options.camera_table, options.config)
+    robot = Robot()
+    exiting = Event()
+    follower = Follower(
+        Networks.load(options.model), routefile.load(options.memory), robot, follower_config
+    )
+    if not options.wait:
+        follower.start()
+    config = LoopConfig(
+        lockstep=options.lockstep or options.clock == "sim",
+        unstamped=options.twist,
+        exit_when_done=options.exit_when_done,
+        patience_s=options.patience,
+    )
+    received = exit_on_signals(exiting)
+    with Link.open(shared.link_config(options)) as link:
+        sensors = Sensors(link, View(camera), robot)
+        code = Loop(link, follower, sensors, config, exiting).run()
+    if received and options.exit_when_done:
+        return 128 + received[0]  # told to go before it was done
+    return code
+
+
+def exit_on_signals(exiting: Event) -> list[int]:
+    """Set `exiting` on SIGINT, SIGTERM and SIGHUP; the list then holds their numbers."""
+    received: list[int] = []
+
+    def handle(number: int, _frame: object) -> None:
+        received.append(number)
+        exiting.set()
+
+    for number in SIGNALS:
+        signal.signal(number, handle)
+    return received

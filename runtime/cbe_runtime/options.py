@@ -1,0 +1,183 @@
+"""Command-line options that several commands share, and their values from a TOML file."""
+
+from __future__ import annotations
+
+import argparse
+import tomllib
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from cbe.camera import CameraModel
+from cbe.errors import CameraError, ConfigError
+from cbe.linkconfig import LOOPBACK, LinkConfig
+from cbe.topics import KeyStyle
+from cbe_runtime.follower import FollowerConfig
+from cbe_runtime.networks import PACKAGED_MODELS
+from cbe_runtime.route import AttractorPrecision, EmbeddingPrecision
+
+TABLES = ("camera", "follower")
+
+
+def add_link(parser: argparse.ArgumentParser) -> None:
+    """--connect, --listen, --robot, --domain, --key-style."""
+    group = parser.add_argument_group("link")
+    group.add_argument(
+        "--connect",
+        metavar="ENDPOINT",
+        action="append",
+        help=f"Zenoh endpoint to connect to; may be repeated (default {LOOPBACK})",
+    )
+    group.add_argument(
+        "--listen",
+        metavar="ENDPOINT",
+        action="append",
+        help="Zenoh endpoint to listen on as the hub of the others; may be repeated",
+    )
+    group.add_argument(
+        "--robot", default="robot", help="name in the keys cbe/v1/<robot>/... (default robot)"
+    )
+    group.add_argument(
+        "--domain", type=int, default=0, help="ROS domain, for the key style rmw_zenoh (default 0)"
+    )
+    group.add_argument(
+        "--key-style",
+        choices=[style.value for style in KeyStyle],
+        default=KeyStyle.RMW_ZENOH.value,
+        help="keys of ROS 2 nodes on rmw_zenoh (default), or bare names as "
+        "zenoh-bridge-ros2dds uses",
+    )
+
+
+def link_config(options: argparse.Namespace) -> LinkConfig:
+    """The link that these options ask for.
+
+    Raises:
+        ConfigError: an endpoint or name is malformed.
+    """
+    style = KeyStyle(options.key_style)
+    names: dict[str, Any] = {"robot": options.robot, "domain": options.domain, "style": style}
+    if not options.listen:
+        return LinkConfig(connect=tuple(options.connect or (LOOPBACK,)), **names)
+    return LinkConfig(
+        mode="router",
+        connect=tuple(options.connect or ()),
+        listen=tuple(options.listen),
+        **names,
+    )
+
+
+def add_model(parser: argparse.ArgumentParser) -> None:
+    """--model."""
+    parser.add_argument(
+        "--model",
+        type=Path,
+        default=PACKAGED_MODELS,
+        metavar="DIR",
+        help="folder with encoder.onnx, attractor.onnx and generator.onnx (default: the shipped "
+        "model)",
+    )
+
+
+def add_camera(parser: argparse.ArgumentParser) -> None:
+    """--camera."""
+    parser.add_argument(
+        "--camera",
+        type=Path,
+        metavar="FILE",
+        help="TOML file with the camera's width, height, fx, fy, cx, cy [, model, distortion] in "
+        "pixels, in place of camera_info",
+    )
+
+
+def add_precision(parser: argparse.ArgumentParser) -> None:
+    """--attractors, --embeddings."""
+    parser.add_argument(
+        "--attractors",
+        type=AttractorPrecision,
+        choices=list(AttractorPrecision),
+        default=AttractorPrecision.U8,
+        help="how a route stores attractors (default u8)",
+    )
+    parser.add_argument(
+        "--embeddings",
+        type=EmbeddingPrecision,
+        choices=list(EmbeddingPrecision),
+        default=EmbeddingPrecision.F16,
+        help="how a route stores embeddings (default f16)",
+    )
+
+
+def read_camera(path: Path | None) -> CameraModel | None:
+    """The camera of a TOML file.
+
+    Raises:
+        ConfigError: the file is no TOML or no camera.
+    """
+    return None if path is None else camera_of(read_toml(path), path)
+
+
+def camera_of(values: dict[str, Any], path: Path) -> CameraModel:
+    """The camera of a TOML table.
+
+    Raises:
+        ConfigError: the values describe none.
+    """
+    try:
+        return CameraModel.from_dict(values)
+    except CameraError as error:
+        raise ConfigError(f"{path} holds no usable camera: {error}") from error
+
+
+def follower_config(values: dict[str, Any], path: Path) -> FollowerConfig:
+    """The follower's settings of a TOML table.
+
+    Raises:
+        ConfigError: a key is unknown or a value out of range.
+    """
+    known = [field.name for field in fields(FollowerConfig)]
+    unknown = sorted(set(values) - set(known))
+    if unknown:
+        raise ConfigError(f"{path}: [follower] has unknown {unknown}; known: {known}")
+    try:
+        return msgspec.convert(values, FollowerConfig)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{path}: [follower] is wrong: {error}") from error
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """A TOML file's values.
+
+    Raises:
+        ConfigError: it cannot be read or is no TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text())
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror}; check the path") from error
+    except ValueError as error:  # no TOML, or no UTF-8
+        raise ConfigError(f"{path} is no TOML file: {error}") from error
+
+
+def arguments_of(values: dict[str, Any], path: Path) -> list[str]:
+    """A TOML file's keys as the command-line arguments they stand for, checked like any other.
+
+    Raises:
+        ConfigError: a value is of a kind that no option takes.
+    """
+    arguments: list[str] = []
+    for key, value in values.items():
+        if key in TABLES:
+            continue
+        option = f"--{key.replace('_', '-')}"
+        if value is True:
+            arguments.append(option)
+        elif isinstance(value, (str, int, float)) and value is not False:
+            arguments.append(f"{option}={value}")
+        elif isinstance(value, list) and all(isinstance(each, str) for each in value):
+            arguments.extend(f"{option}={each}" for each in value)
+        elif value is not False:
+            raise ConfigError(f"{path}: {key} = {value!r} is nothing that {option} takes")
+    return arguments

@@ -1,0 +1,71 @@
+"""Records what is on the link; a slow disk costs messages, counted, never memory."""
+
+from __future__ import annotations
+
+import logging
+import time
+from typing import TYPE_CHECKING
+
+from cbe import topics
+from cbe_runtime.mcapfile import Recorded
+
+if TYPE_CHECKING:
+    from threading import Event
+
+    from cbe.link import Link
+    from cbe_runtime.mcapfile import Recorder
+
+logger = logging.getLogger(__name__)
+
+POLL_S = 0.05
+CAPACITY = 512
+"""Messages a topic may wait for the disk: close to a minute at 10 Hz."""
+
+
+class Recording:
+    """Subscribes to camera, scan, calibration, odometry and commands when made."""
+
+    def __init__(self, link: Link, unstamped: bool = False) -> None:
+        commands = topics.CMD_VEL_UNSTAMPED if unstamped else topics.CMD_VEL
+        wanted = (
+            topics.CAMERA,
+            topics.CAMERA_RAW,
+            topics.SCAN,
+            topics.CAMERA_INFO,
+            topics.ODOM,
+            commands,
+        )
+        self._streams = [(topic, link.stream(topic, CAPACITY)) for topic in wanted]
+        # Messages are dated by the wall clock, received by the monotonic one.
+        self._wall_ns = time.time_ns() - time.monotonic_ns()
+
+    @property
+    def dropped(self) -> int:
+        """Messages lost because the disk was too slow."""
+        return sum(stream.dropped for _, stream in self._streams)
+
+    def run(self, recorder: Recorder, ending: Event, duration_s: float | None = None) -> None:
+        """Write until `ending` is set or the time is over, and what has come till then.
+
+        Raises:
+            RecordingError: the disk is full or gone.
+        """
+        end_s = float("inf") if duration_s is None else time.monotonic() + duration_s
+        while not ending.wait(min(POLL_S, max(end_s - time.monotonic(), 0.0))):
+            self._write(recorder)
+            if time.monotonic() >= end_s:
+                break
+        self._write(recorder)
+        if self.dropped:
+            logger.warning("%d messages were lost: the disk was too slow", self.dropped)
+
+    def _write(self, recorder: Recorder) -> None:
+        """Empty the queues in the order of receipt."""
+        batch = [
+            (sample.received_s, topic, sample.payload)
+            for topic, stream in self._streams
+            for sample in stream.drain()
+        ]
+        for received_s, topic, payload in sorted(batch, key=lambda each: each[0]):
+            log_time_ns = self._wall_ns + round(1e9 * received_s)
+            recorder.write(Recorded(f"/{topic.name}", topic.message.TYPE, payload, log_time_ns))

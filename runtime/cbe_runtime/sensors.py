@@ -1,0 +1,114 @@
+"""The newest camera frame and scan from the link, in the follower's terms."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from cbe import topics
+from cbe.errors import CameraError, CbeError, MessageError
+from cbe.rays import resample
+from cbe_runtime.observation import Frame, Observation, Scan
+
+if TYPE_CHECKING:
+    from cbe.inbox import Latest, Received
+    from cbe.link import Link
+    from cbe.messages import CompressedImage, Image, LaserScan
+    from cbe.robot import Robot
+    from cbe_runtime.view import View
+
+logger = logging.getLogger(__name__)
+
+
+class Sensors:
+    """Reads the camera (raw where no compressed one was heard first), its calibration and scan.
+
+    What is received but cannot be used becomes a sample without content: the follower names it.
+    """
+
+    def __init__(self, link: Link, view: View, robot: Robot) -> None:
+        self._compressed = link.latest(topics.CAMERA)
+        self._raw = link.latest(topics.CAMERA_RAW)
+        self._camera: Latest[CompressedImage] | Latest[Image] = self._compressed
+        self._scans = link.latest(topics.SCAN)
+        self._infos = link.latest(topics.CAMERA_INFO)
+        self._view = view
+        self._robot = robot
+        self._frame: Frame | None = None
+        self._scan: Scan | None = None
+        self._counts = {"camera": 0, "scan": 0, "info": 0}
+        self._complaint = ""
+
+    def observe(self) -> Observation:
+        """The newest frame and scan; each message is decoded once."""
+        self._calibrate()
+        if self._frame is None and not self._compressed.stats.received:
+            self._camera = self._raw if self._raw.stats.received else self._compressed
+        image = self._camera.get()
+        if image is not None and self._is_new("camera", image.count):
+            self._frame = self._framed(image)
+        scan = self._scans.get()
+        if scan is not None and self._is_new("scan", scan.count):
+            self._scan = self._scanned(scan)
+        return Observation(self._frame, self._scan)
+
+    def wait_for_frame(self, timeout_s: float) -> bool:
+        """Whether a frame that `observe` has not seen came within the time."""
+        return self._camera.wait(self._counts["camera"], timeout_s) is not None
+
+    def wait_for_scan(self, timeout_s: float) -> bool:
+        """Whether a scan that `observe` has not seen came within the time."""
+        return self._scans.wait(self._counts["scan"], timeout_s) is not None
+
+    def drops(self) -> dict[str, dict[str, int]]:
+        """Per sensor: messages received, overwritten unread, lost on the way, malformed."""
+        return {"camera": asdict(self._camera.stats), "scan": asdict(self._scans.stats)}
+
+    def _is_new(self, sensor: str, count: int) -> bool:
+        new = count != self._counts[sensor]
+        self._counts[sensor] = count
+        return new
+
+    def _calibrate(self) -> None:
+        info = self._infos.get()
+        if info is None or not self._is_new("info", info.count) or info.message is None:
+            return
+        try:
+            self._view.calibrate(info.message)
+        except CameraError as error:
+            self._complain(error)
+
+    def _framed(self, received: Received[Any]) -> Frame:
+        message, error = received.message, _unread(received)
+        if message is not None:
+            try:
+                return Frame(self._view(message), received.received_s, message.stamp_ns)
+            except (MessageError, CameraError) as unusable:
+                error = unusable
+        self._complain(error)
+        # Every unreadable message counts as a new one, so that it is named bad and not frozen.
+        return Frame(None, received.received_s, -received.count)
+
+    def _scanned(self, received: Received[LaserScan]) -> Scan:
+        message, error = received.message, _unread(received)
+        if message is not None:
+            try:
+                ranges_m = resample(message, self._robot)
+                return Scan(ranges_m, received.received_s, message.stamp_ns)
+            except MessageError as unusable:
+                error = unusable
+        self._complain(error)
+        return Scan(None, received.received_s, -received.count)
+
+    def _complain(self, error: CbeError | None) -> None:
+        """Log what is wrong once, not at 10 Hz."""
+        complaint = str(error)
+        if complaint != self._complaint:
+            logger.warning("%s", complaint)
+        self._complaint = complaint
+
+
+def _unread(received: Received[Any]) -> CbeError | None:
+    """The reason why a message has no content, as the base of what else may go wrong."""
+    return received.error

@@ -1,0 +1,95 @@
+"""Export: the graphs match the signature, parity is measured, and a failed gate writes nothing."""
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from cbe import signature
+from cbe.errors import ModelError
+from cbe_export import export as export_module
+from cbe_export.export import write_graphs
+from cbe_export.parity import Rides, worst_difference
+from cbe_runtime.networks import Networks
+from cbe_training.checkpoint import Learner
+from cbe_training.config import TrainConfig
+from cbe_training.networks import BehaviorNetworks
+
+
+@pytest.fixture(scope="module")
+def networks() -> BehaviorNetworks:
+    torch.manual_seed(3)
+    return BehaviorNetworks().eval()
+
+
+@pytest.fixture(scope="module")
+def folder(networks: BehaviorNetworks, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("models")
+    write_graphs(networks, folder, network_period=2, segment_steps=100)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def rides() -> Rides:
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, 255, (2, 6, 64, 64, 3), dtype=np.uint8)
+    return Rides(images, np.array([6, 5]), images[::-1].copy())
+
+
+def test_runtime_loads_what_was_exported(folder: Path) -> None:
+    loaded = Networks.load(folder)
+    assert loaded.network_period == 2
+    assert loaded.segment_steps == 100
+    assert loaded.precision == "fp32"
+
+
+def test_every_graph_carries_all_metadata(folder: Path) -> None:
+    for name in ("encoder", "attractor", "generator"):
+        model = onnx.load(folder / f"{name}.onnx")
+        assert {p.key for p in model.metadata_props} >= set(signature.METADATA_KEYS)
+
+
+def test_onnxruntime_agrees_with_torch_through_the_recurrence(
+    networks: BehaviorNetworks, folder: Path, rides: Rides
+) -> None:
+    worst, ticks = worst_difference(networks, folder, rides)
+    assert ticks == 11
+    assert worst < 1e-4
+
+
+def test_parity_notices_a_changed_weight(
+    networks: BehaviorNetworks, folder: Path, rides: Rides
+) -> None:
+    other = BehaviorNetworks().eval()
+    other.load_state_dict(networks.state_dict())
+    with torch.no_grad():
+        other.encoder.lstm.weight_hh_l0[0] += 0.5
+    worst, _ = worst_difference(other, folder, rides)
+    assert worst > 1e-4
+
+
+def test_model_id_follows_the_weights(networks: BehaviorNetworks, tmp_path: Path) -> None:
+    ids = []
+    for scale in (1.0, 1.0001):
+        with torch.no_grad():
+            networks.generator.out.bias *= scale
+        target = tmp_path / str(scale)
+        target.mkdir()
+        ids.append(write_graphs(networks, target, network_period=2, segment_steps=100))
+    assert ids[0] != ids[1]
+
+
+def test_failed_parity_writes_nothing(
+    tmp_path: Path, rides: Rides, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Learner(TrainConfig(), torch.device("cpu")).save(tmp_path / "run")
+    monkeypatch.setattr(Rides, "record", lambda networks, cache: rides)
+    monkeypatch.setattr(export_module, "worst_difference", lambda *_: (2e-4, 300))
+    target = tmp_path / "models"
+    with pytest.raises(ModelError, match="nothing was written"):
+        export_module.export(
+            tmp_path / "run", target, network_period=2, segment_steps=100, cache=tmp_path
+        )
+    assert not target.exists()

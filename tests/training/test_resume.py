@@ -1,0 +1,79 @@
+"""A run that is cut in two ends as the run that was not."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from cbe.errors import ModelError
+from cbe_hil_sim.generate import generate
+from cbe_training.checkpoint import Learner, load_networks
+from cbe_training.config import TrainConfig
+from cbe_training.drives import Drives, cache_name
+from cbe_training.team import Team
+from cbe_training.train import iterate
+
+# Past cloning, so that the networks' own driving is part of what must repeat.
+CONFIG = replace(
+    TrainConfig(),
+    worlds=2,
+    demonstrations=4,
+    minibatch=2,
+    epochs=1,
+    cloning_iterations=1,
+    annealing_iterations=1,
+)
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Drives:
+    return Drives.build(range(2), 8, tmp_path_factory.mktemp("drives"))
+
+
+def _iterate(learner: Learner, drives: Drives, count: int) -> None:
+    for _ in range(count):
+        iterate(learner, drives, 1.0, Team())
+        learner.iteration += 1
+
+
+def test_resumed_run_equals_uninterrupted_run(
+    drives: Drives, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(TrainConfig, "frames", lambda self, iteration: (6, 9))
+    device = torch.device("cpu")
+    whole = Learner(CONFIG, device)
+    _iterate(whole, drives, 3)
+
+    first = Learner(CONFIG, device)
+    _iterate(first, drives, 2)
+    first.save(tmp_path)
+    second = Learner(CONFIG, device)
+    second.load(tmp_path)
+    _iterate(second, drives, 1)
+
+    assert second.iteration == 3
+    assert second.updates == whole.updates
+    for name, value in whole.networks.state_dict().items():
+        torch.testing.assert_close(second.networks.state_dict()[name], value, msg=name)
+    for name, value in whole.average.state_dict().items():
+        torch.testing.assert_close(second.average.state_dict()[name], value, msg=name)
+
+
+def test_drives_from_the_cache_equal_those_driven(drives: Drives, tmp_path: Path) -> None:
+    driven = Drives.build(range(1), 3, tmp_path)
+    cached = Drives.build(range(1), 3, tmp_path)
+    assert len(driven.poses) == len(cached.poses) > 0
+    for a, b in zip(driven.poses, cached.poses, strict=True):
+        assert abs(a - b).max() == 0.0
+
+
+def test_folder_without_checkpoint_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match=r"state.json is missing; run cbe-train"):
+        load_networks(tmp_path)
+
+
+def test_a_changed_world_is_driven_again() -> None:
+    world = generate(0)
+    other = world.with_cylinder(3.0, 3.0, 0.2, 1.0, 0)
+    assert cache_name([world], 3) != cache_name([other], 3)
