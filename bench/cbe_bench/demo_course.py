@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from cbe.errors import WorldError
 from cbe.geometry import wrap_angle
+from cbe_bench.scenario import JITTER_LIMIT_M, JITTER_M, JITTER_RAD
 from cbe_hil_sim.astar import SPACING_M, GoalField, plan
 from cbe_hil_sim.demonstrator import start_pose
 
@@ -23,9 +24,9 @@ SHORTEST_M, LONGEST_M = 10.0, 15.0
 END_CLEARANCE_M = 0.45  # the jittered start needs room, and a drive should not end in a corner
 WAY_CLEARANCE_M = 0.24
 LINTEL_M = 1.8  # what spans free floor from above this up to the ceiling is a lintel
+DOOR_DISTANCE_POINTS = 16  # no drive begins or ends within 0.8 m of a door
 GOALS, STARTS = 40, 6
 
-JITTER_M, JITTER_LIMIT_M, JITTER_RAD = 0.3, 1.0, math.radians(13.5)  # facts.md: the paper's
 START_CLEARANCE_M = 0.25
 
 BIN_M = 0.3
@@ -104,8 +105,13 @@ def _cut(
     best: Course | None = None
     for first in range(0, len(path) - points + 1, 10):
         part = slice(first, first + points)
-        ends = min(clearance[first], clearance[first + points - 1])
-        if points < shortest or ends < END_CLEARANCE_M or clearance[part].min() < WAY_CLEARANCE_M:
+        near_ends = crossed[part][:DOOR_DISTANCE_POINTS], crossed[part][-DOOR_DISTANCE_POINTS:]
+        if (
+            points < shortest
+            or min(clearance[first], clearance[first + points - 1]) < END_CLEARANCE_M
+            or clearance[part].min() < WAY_CLEARANCE_M
+            or np.any(near_ends)
+        ):
             continue
         passed = len(set(crossed[part].tolist()) - {0})
         if best is None or passed > best.doors:
@@ -161,7 +167,7 @@ def _free_m(world: World, point: NDArray[np.float64], direction: NDArray[np.floa
     return float(steps[int(blocked.argmax())] if blocked.any() else steps[-1])
 
 
-def _way_past(world: World, ends: NDArray[np.float64], centre: NDArray[np.float64]) -> bool:
+def _way_past(world: World, ends: NDArray[np.floating], centre: NDArray[np.float64]) -> bool:
     """Whether a robot gets from one end to the other with the bin in place."""
     standing = world.with_cylinder(
         float(centre[0]), float(centre[1]), BIN_M * math.sqrt(0.5), BIN_HEIGHT_M, 0

@@ -29,7 +29,11 @@ LOG_LINES = 15
 
 
 class ProcessError(CbeError):
-    """A command ended early, failed or did not end in time."""
+    """A command ended early or failed."""
+
+
+class OverdueError(ProcessError):
+    """Something did not happen in time."""
 
 
 def free_port() -> int:
@@ -79,11 +83,11 @@ class Child:
             raise ProcessError(f"{self.name} ended with code {self.returncode}:\n{self.tail()}")
 
     def wait(self, timeout_s: float) -> int:
-        """Its exit code; ProcessError if it still runs after `timeout_s`."""
+        """Its exit code; OverdueError if it still runs after `timeout_s`."""
         try:
             return self._process.wait(timeout_s)
         except subprocess.TimeoutExpired as error:
-            raise ProcessError(
+            raise OverdueError(
                 f"{self.name} did not end within {timeout_s:.0f} s:\n{self.tail()}"
             ) from error
 

@@ -19,7 +19,7 @@ GROUP = 10
 
 JITTER_M, JITTER_LIMIT_M = 0.3, 1.0
 JITTER_RAD = math.radians(13.5)
-START_CLEARANCE_M = 0.03  # from the body's surface
+START_CLEARANCE_M = 0.08  # from the body's surface: the car cannot back out of a corner
 SIGHT_CLEARANCE_M = 0.05  # along the line to the demonstration's start
 BIN_MARGIN_SAMPLES = 10
 BIN_PASSAGE_M = 0.6

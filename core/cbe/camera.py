@@ -262,18 +262,25 @@ class _Remap:
 
 def coverage(camera: CameraModel, view: CameraModel = MODEL_CAMERA) -> Coverage:
     """How much of a pinhole `view` the camera sees."""
-    x, y = _rays(view, 4)  # (4 h, 4 w) each
+    x, y = _rays(view, 2)  # (2 h, 2 w) each
     _, _, seen = camera.project(x, y)
     weight = (1.0 + x**2 + y**2) ** -1.5  # solid angle of equal cells of the image plane
-    columns = (np.arange(4 * view.width + 1) / 4.0 - view.cx) / view.fx
-    rows = (np.arange(4 * view.height + 1) / 4.0 - view.cy) / view.fy
-    middle_row = int(np.abs(rows[:-1]).argmin())
-    middle_column = int(np.abs(columns[:-1]).argmin())
+    across_rad = _angles(view.cx, view.fx, view.width)
+    down_rad = _angles(view.cy, view.fy, view.height)
+    level = np.zeros_like(across_rad)
+    _, _, seen_across = camera.project(np.tan(across_rad), level)
+    _, _, seen_down = camera.project(level, np.tan(down_rad))
     return Coverage(
-        horizontal_deg=float(np.degrees(np.diff(np.arctan(columns)) @ seen[middle_row])),
-        vertical_deg=float(np.degrees(np.diff(np.arctan(rows)) @ seen[:, middle_column])),
+        horizontal_deg=float(np.degrees(np.ptp(across_rad)) * seen_across.mean()),
+        vertical_deg=float(np.degrees(np.ptp(down_rad)) * seen_down.mean()),
         share=float(weight[seen].sum() / weight.sum()),
     )
+
+
+def _angles(centre_px: float, focal_px: float, size_px: int) -> Floats:
+    """Angles (2000,) rad evenly across a pinhole image's axis."""
+    first, last = np.arctan([-centre_px / focal_px, (size_px - centre_px) / focal_px])
+    return np.linspace(first + 1e-9, last - 1e-9, 2000)  # inside, whatever is rounded
 
 
 def _rays(view: CameraModel, factor: int) -> tuple[Floats, Floats]:

@@ -149,8 +149,15 @@ class Link:
         One that already lives is reported at once.
         """
 
+        last: bool | None = None
+
         def on_sample(sample: zenoh.Sample) -> None:
-            changed(sample.kind == zenoh.SampleKind.PUT)
+            nonlocal last
+            alive = sample.kind == zenoh.SampleKind.PUT
+            # A token that is queried while it appears is reported twice.
+            if alive is not last:
+                last = alive
+                changed(alive)
 
         key = self.config.own_key(f"alive/{process}")
         declare = self._session.liveliness().declare_subscriber

@@ -60,9 +60,7 @@ class Manoeuvres:
         x = lead_x[:, -1, None, None] + np.cos(turned) * tail_x - np.sin(turned) * tail_y
         y = lead_y[:, -1, None, None] + np.sin(turned) * tail_x + np.cos(turned) * tail_y
         # (2, F * 3 + F * G * 7): the leads, each shared by G manoeuvres, then the tails.
-        self._tree = np.stack(
-            [np.append(lead_x, x), np.append(lead_y, y)]
-        ).astype(np.float32)
+        self._tree = np.stack([np.append(lead_x, x), np.append(lead_y, y)]).astype(np.float32)
         manoeuvre = np.arange(len(self._first))
         begin = manoeuvre[:, None] // gains.second_arcs * FIRST_SAMPLES + np.arange(FIRST_SAMPLES)
         end = lead_x.size + manoeuvre[:, None] * SECOND_SAMPLES + np.arange(SECOND_SAMPLES)

@@ -33,8 +33,9 @@ class Graph:
 
 
 def encoder(state_size: int) -> Graph:
-    """Behavior encoder: image (1, 64, 64, 3) uint8 RGB; `is_first` is 1 on a behavior's first frame.
+    """Behavior encoder of one image (1, 64, 64, 3) uint8 RGB.
 
+    `is_first` is 1 on a behavior's first frame, whose state inputs are ignored;
     `embedding` is z of the frames seen since then (32 numbers).
     """
     state = (1, state_size)

@@ -12,10 +12,11 @@ class LstmCell(nn.Module):
 
     def __init__(self, lstm: nn.LSTM) -> None:
         super().__init__()
-        weights = torch.cat([lstm.weight_ih_l0, lstm.weight_hh_l0], dim=1).detach()
+        stored = lstm.state_dict()
+        weights = torch.cat([stored["weight_ih_l0"], stored["weight_hh_l0"]], dim=1)
         self.gates = nn.Linear(weights.shape[1], weights.shape[0])
         self.gates.weight = nn.Parameter(weights)
-        self.gates.bias = nn.Parameter((lstm.bias_ih_l0 + lstm.bias_hh_l0).detach())
+        self.gates.bias = nn.Parameter(stored["bias_ih_l0"] + stored["bias_hh_l0"])
 
     def forward(self, x: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
         """Input (1, I) and state (1, S) twice, to the next state."""
@@ -56,7 +57,7 @@ class AttractorTick(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """See `cbe.signature.attractor`."""
-        return self.attractor(features)  # type: ignore[no-any-return]
+        return self.attractor(features)
 
 
 class GeneratorTick(nn.Module):

@@ -14,7 +14,7 @@ from cbe.errors import CameraError, WorldError
 from cbe.geometry import from_frame
 from cbe.robot import Robot
 from cbe_hil_sim.backend import Observation
-from cbe_hil_sim.car import SOLID, SUBSTEPS, TIME_STEP_S, Car
+from cbe_hil_sim.car import SOLID, SOLID_MASK, SUBSTEPS, TIME_STEP_S, Car
 from cbe_hil_sim.scene import Patch, Scene, solidify
 from cbe_hil_sim.world import BLOCKING_HEIGHT_M
 
@@ -160,7 +160,7 @@ class BulletBackend:
         low = solid_m[solid_m[..., 2].min(axis=1) < BLOCKING_HEIGHT_M]
         for body in solidify(low, self._physics):
             pybullet.setCollisionFilterGroupMask(
-                body, -1, SOLID, -1, physicsClientId=self._physics
+                body, -1, SOLID, SOLID_MASK, physicsClientId=self._physics
             )
             self._solids.append(body)
 

@@ -14,8 +14,9 @@ from cbe.robot import STEP_S, Robot
 SUBSTEPS = 24
 TIME_STEP_S = STEP_S / SUBSTEPS
 
-# Collision groups: a pair meets where each one's group is in the other's mask.
+# Collision groups. A pair meets where either's group is in the other's mask; rays are in group 1.
 SOLID, GROUND, BODY, WHEEL = 1, 2, 4, 8
+SOLID_MASK = SOLID | BODY
 
 _TRACK_M = 0.1
 _WHEEL_RADIUS_M = 0.03

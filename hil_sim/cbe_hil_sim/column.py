@@ -39,7 +39,10 @@ class ColumnBackend:
         self.robot = robot or Robot()
         self.camera = camera
         self.world_index = np.asarray(world_index, dtype=np.int64)
-        if self.world_index.size and not 0 <= self.world_index.min() <= self.world_index.max() < len(worlds):
+        if (
+            self.world_index.size
+            and not 0 <= self.world_index.min() <= self.world_index.max() < len(worlds)
+        ):
             raise WorldError(
                 f"world_index {self.world_index.min()} to {self.world_index.max()} does not fit "
                 f"{len(worlds)} worlds"

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cbe.controller import RmpController, twist
+from cbe.controller import Motion, RmpController, twist
 from cbe.errors import WorldError
 from cbe.geometry import to_frame
-from cbe.robot import Robot
+from cbe.robot import STEP_S, Robot
 from cbe.stop_zone import limit
 from cbe_hil_sim.astar import SPACING_M, GoalField
 from cbe_hil_sim.clearance import Clearance
@@ -145,30 +145,17 @@ def demonstrate(
     A drive fails by touching something or by not arriving in three times the time its path
     would take at full speed. `batch` is `WorldBatch.pack(worlds)`. `noise` as in `Vehicle`.
     """
-    drives = _drive(batch, worlds, world_index, paths, robot, controller, noise, rng)
-    return [drive for drive in drives if drive is not None]
-
-
-def _drive(
-    batch: WorldBatch,
-    worlds: Sequence[World],
-    world_index: NDArray[np.integer],
-    paths: Sequence[NDArray[np.float64]],
-    robot: Robot,
-    controller: RmpController | None,
-    noise: float,
-    rng: np.random.Generator | None,
-) -> list[Demonstration | None]:
     controller = controller or RmpController(robot)
     clearance = Clearance(worlds)
     vehicle = Vehicle(np.stack([start_pose(p) for p in paths]), robot, noise=noise, rng=rng)
     follower = PathFollower(paths)
     active = np.arange(len(paths))
     where = np.asarray(world_index, dtype=np.int64)
-    deadline = np.array([100 + round(3.0 * len(p) * SPACING_M / robot.max_speed_mps * 10) for p in paths])
+    fastest = np.array([len(p) for p in paths]) * SPACING_M / (robot.max_speed_mps * STEP_S)
+    deadline = 100 + np.ceil(3.0 * fastest).astype(np.int64)
     steps = int(deadline.max()) + 1
     log = np.zeros((len(paths), steps, 6))  # x, y, yaw, speed, steering, clearance
-    drives: list[Demonstration | None] = [None] * len(paths)
+    drives: list[Demonstration] = []
     commanded = vehicle.motion
     for step in range(steps):
         body = clearance.at(where, vehicle.poses[:, :2]) - robot.body_radius_m
@@ -180,23 +167,29 @@ def _drive(
         arrived = resting & (follower.end_distance_m(vehicle.poses) < ARRIVED_M)
         for b in active[arrived]:
             part = log[b, : step + 1]
-            drives[b] = Demonstration(
-                world_name=worlds[world_index[b]].name, world=int(world_index[b]), route=int(b),
-                poses=part[:, :3].copy(), speed_mps=part[:, 3].copy(),
-                steer_rad=part[:, 4].copy(), min_clearance_m=float(part[:, 5].min()),
-            )  # fmt: skip
+            drives.append(
+                Demonstration(
+                    world_name=worlds[world_index[b]].name,
+                    world=int(world_index[b]),
+                    route=int(b),
+                    poses=part[:, :3].copy(),
+                    speed_mps=part[:, 3].copy(),
+                    steer_rad=part[:, 4].copy(),
+                    min_clearance_m=float(part[:, 5].min()),
+                )
+            )
         going = ~arrived & (body >= 0.0) & (step < deadline[active])
         if not going.all():
             active, where, waypoint = active[going], where[going], waypoint[going]
             follower.keep(going)
             vehicle.keep(going)
-            commanded = type(commanded)(commanded.speed_mps[going], commanded.steer_rad[going])
+            commanded = Motion(commanded.speed_mps[going], commanded.steer_rad[going])
         if len(active) == 0:
             break
         scans = scan(batch, where, vehicle.poses, robot)
         commanded = limit(controller.step(commanded, waypoint, scans), scans, robot)
         vehicle.step(*twist(commanded, robot))
-    return drives
+    return sorted(drives, key=lambda drive: drive.route)
 
 
 def _cut(

@@ -1,4 +1,4 @@
-"""A 2.5-D world: per grid cell a solid from the floor and one hanging span, under a flat ceiling."""
+"""A 2.5-D world: per cell a solid from the floor and one hanging span, under a flat ceiling."""
 
 from dataclasses import dataclass, field, replace
 
@@ -64,8 +64,10 @@ class World:
     def __post_init__(self) -> None:
         """Check the grids' shapes and derive `clearance_m`, metres to the nearest blocked cell."""
         shape = self.solid_top_m.shape
-        grids = (self.span_bottom_m, self.span_top_m, self.solid_side, self.solid_cap)
-        grids += (self.span_surface, self.floor_surface, self.ceiling_surface)
+        grids = (
+            self.span_bottom_m, self.span_top_m, self.solid_side, self.solid_cap,
+            self.span_surface, self.floor_surface, self.ceiling_surface,
+        )  # fmt: skip
         if len(shape) != 2 or any(grid.shape != shape for grid in grids):
             shapes = [shape, *(grid.shape for grid in grids)]
             raise WorldError(f"grids of one world must share one 2-D shape; found {shapes}")

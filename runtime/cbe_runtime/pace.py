@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 LEAD_S = 0.004
 """A tick aims at this long after its camera frame came: the frame's jitter, no more."""
-MAX_SHIFT_S = 0.005
+MAX_SHIFT_S = 0.02
 POLL_S = 0.05
 MAX_REPEATS = 3
 SCAN_PATIENCE_S = 1.0
@@ -32,7 +32,7 @@ class Pace(Protocol):
 class Ratekeeper:
     """Waits for absolute, monotonic deadlines; those missed by an overrun are skipped.
 
-    The deadlines' phase slides, a few milliseconds a tick, to just after the camera's frames:
+    The deadlines' phase slides to just after the camera's frames:
     else a frame would wait for its tick half a period on average.
     """
 
@@ -67,7 +67,7 @@ class Ratekeeper:
         error_s = age_s - LEAD_S
         if error_s > 0.5 * self._period_s:
             error_s -= self._period_s  # the next frame is nearer than the last one
-        return max(-MAX_SHIFT_S, min(0.2 * error_s, MAX_SHIFT_S))
+        return max(-MAX_SHIFT_S, min(0.5 * error_s, MAX_SHIFT_S))
 
 
 class LockStep:

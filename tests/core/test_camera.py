@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cbe.camera import MODEL_CAMERA, CameraModel, Preprocessor, coverage
-from cbe.errors import CameraError
 from hypothesis import given
 from hypothesis import strategies as st
+
+from cbe.camera import MODEL_CAMERA, CameraModel, Preprocessor, coverage
+from cbe.errors import CameraError
 
 FISHEYE = CameraModel(640, 480, 190.0, 190.0, 320.0, 240.0, "fisheye", (0.02, -0.004, 0.0, 0.0))
 WIDE = CameraModel(640, 480, 150.0, 150.0, 320.0, 240.0)
@@ -58,9 +59,15 @@ def test_larger_image_of_the_same_view_becomes_the_mean_over_each_pixel() -> Non
 
 @pytest.mark.parametrize(
     "camera",
-    [MODEL_CAMERA.scaled(160, 120), WIDE, WIDE.scaled(1280, 960), FISHEYE, FISHEYE.scaled(320, 240)],
+    [
+        MODEL_CAMERA.scaled(160, 120),
+        WIDE,
+        WIDE.scaled(1280, 960),
+        FISHEYE,
+        FISHEYE.scaled(320, 240),
+    ],
     ids=["same view", "wide", "wide and large", "fisheye", "small fisheye"],
-)  # fmt: skip
+)
 def test_every_camera_looks_where_the_model_camera_looks(camera: CameraModel) -> None:
     out = Preprocessor(camera)(directions(camera)).astype(float)
     seen = out[..., 2] == 200.0
@@ -191,6 +198,8 @@ def test_image_that_does_not_fit_the_camera_is_refused(image: np.ndarray) -> Non
 
 
 def test_import_pulls_numpy_alone() -> None:
-    code = "import sys, cbe.camera; print({'cv2', 'zenoh', 'rosbags', 'msgspec'} & set(sys.modules))"
+    code = (
+        "import sys, cbe.camera; print({'cv2', 'zenoh', 'rosbags', 'msgspec'} & set(sys.modules))"
+    )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "set()"

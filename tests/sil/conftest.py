@@ -31,18 +31,23 @@ ENTRY_POINTS = {
     "cbe-teach": "cbe_runtime.cli:teach_main",
     "cbe-record": "cbe_runtime.cli:record_main",
 }
-DEADLINE_S = 30.0  # for what takes a second on an idle machine
+DEADLINE_S = 120.0  # for what takes a second on an idle machine
 
 
-def until(condition, what, timeout_s=DEADLINE_S):
+@pytest.fixture(scope="session")
+def until():
     """Poll a condition; its first true value, or a failure that says what was waited for."""
-    deadline = time.monotonic() + timeout_s
-    while time.monotonic() < deadline:
-        value = condition()
-        if value:
-            return value
-        time.sleep(0.01)
-    raise AssertionError(f"waited {timeout_s:g} s in vain for {what}")
+
+    def until(condition, what):
+        deadline = time.monotonic() + DEADLINE_S
+        while time.monotonic() < deadline:
+            value = condition()
+            if value:
+                return value
+            time.sleep(0.03)
+        raise AssertionError(f"waited {DEADLINE_S:g} s in vain for {what}")
+
+    return until
 
 
 class Process:

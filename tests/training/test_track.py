@@ -32,7 +32,7 @@ def test_progress_is_the_share_of_arc_length() -> None:
 
 def test_a_path_that_crosses_itself_is_searched_near_the_last_sample() -> None:
     out = np.stack([np.arange(60) * 0.05, np.zeros(60), np.zeros(60)], axis=-1)
-    back = out[::-1] + [0.0, 0.01, 0.0]
+    back = out[::-1] + np.array([0.0, 0.01, 0.0])
     path = np.concatenate([out, back])
     assert _label([0.5, 0.004, 0.0], 9, path).closest[0] == 10
     assert _label([0.5, 0.004, 0.0], 108, path).closest[0] == 109

@@ -1,1 +1,1 @@
-"""Train the behavior networks on simulated drives: cloning, then DAgger (paper, Sec. III and IV)."""
+"""Train the behavior networks on simulated drives: cloning, then DAgger (paper, Sec. III-IV)."""

@@ -43,9 +43,7 @@ def load_networks(folder: Path) -> BehaviorNetworks:
 class Learner:
     """What changes while training: networks, heads, optimiser, moving average, iteration."""
 
-    def __init__(
-        self, config: TrainConfig, device: torch.device, *, bf16: bool = False
-    ) -> None:
+    def __init__(self, config: TrainConfig, device: torch.device, *, bf16: bool = False) -> None:
         torch.manual_seed(config.seed)
         self.config = config
         self.device = device

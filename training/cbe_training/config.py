@@ -34,8 +34,8 @@ class TrainConfig:
     weight_decay: float = 1e-4
     clip_norm: float = 1.0
     average_decay: float = 0.998  # of the exported moving average of the weights
-    cloning_iterations: int = 120  # expert at the wheel, short behaviors
-    annealing_iterations: int = 120  # the expert's share falls from 1 to 0
+    cloning_iterations: int = 70  # expert at the wheel, short behaviors
+    annealing_iterations: int = 100  # the expert's share falls from 1 to 0
     expert_episodes: float = 0.2  # always driven by the (noisy) expert
     wrong_episodes: float = 0.06  # shown another behavior's memory
     joining_episodes: float = 0.1  # start in the middle of the behavior
@@ -50,10 +50,10 @@ class TrainConfig:
     def frames(self, iteration: int) -> tuple[int, int]:
         """Shortest and longest behavior of an iteration, in network frames."""
         if iteration < self.cloning_iterations:
-            return 12, 28
+            return 12, 24
         if iteration < self.cloning_iterations + self.annealing_iterations:
-            return 22, 44
-        return 30, 66
+            return 20, 40
+        return 28, 60
 
     def expert_share(self, iteration: int) -> float:
         """Probability that a tick is driven by the expert's waypoint."""

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from torch.utils.tensorboard import SummaryWriter
+    pass
 
 LOSSES = ("waypoint", "progress", "on_route", "motion", "displacement", "shape", "relation")
 STEPS = (64, 128)

@@ -48,7 +48,9 @@ class Drives:
             cache.mkdir(parents=True, exist_ok=True)
             length = np.array([len(p) for p in poses])
             np.savez_compressed(path, world=world, poses=np.concatenate(poses), length=length)
-        logger.info("%d drives, %.0f steps on average", len(poses), np.mean([len(p) for p in poses]))
+        logger.info(
+            "%d drives, %.0f steps on average", len(poses), np.mean([len(p) for p in poses])
+        )
         return cls(WorldBatch.pack(worlds), Clearance(worlds), world, list(poses))
 
 

@@ -105,7 +105,7 @@ def compute(
     networks: BehaviorNetworks, heads: AuxiliaryHeads, batch: Minibatch, weights: LossWeights
 ) -> tuple[Tensor, dict[str, float]]:
     """Weighted loss and its parts."""
-    shown, steps = batch.shown_images.shape[:2]
+    shown = len(batch.shown_images)
     count, longest = batch.images.shape[:2]
     shown_motion, shown_ends, _ = _look(networks, batch.shown_images, whole=False)
     motion, _, attractors = _look(networks, batch.images, whole=True)
@@ -164,7 +164,9 @@ def compute(
     return total, {name: float(part.detach()) for name, part in parts.items()}
 
 
-def _look(networks: BehaviorNetworks, images: Tensor, *, whole: bool) -> tuple[Tensor, Tensor, Tensor]:
+def _look(
+    networks: BehaviorNetworks, images: Tensor, *, whole: bool
+) -> tuple[Tensor, Tensor, Tensor]:
     """Motion (B, T, motion), attractors of the ends (B, 2, 400) and, if `whole`, of all frames."""
     count, steps = images.shape[:2]
     motions, ends, attractors = [], [], []

@@ -50,7 +50,7 @@ class Trunk(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """(N, 64, 64, 3) uint8 RGB to (N, 32, 16, 16)."""
-        x = image.permute(0, 3, 1, 2).float() / 255.0 - 0.5
+        x = image.permute(0, 3, 1, 2).float() / 64.0 - 2.0  # about unit variance
         return F.relu(self.stem(x))
 
 
@@ -192,6 +192,14 @@ class BehaviorNetworks(nn.Module):
         self.encoder = Encoder(self.config)
         self.attractor = Attractor(self.config)
         self.generator = Generator(self.config)
+        self.apply(_initialise)
+
+
+def _initialise(module: nn.Module) -> None:
+    """He initialisation: with torch's default, views differ too little for attractors to learn."""
+    if isinstance(module, nn.Conv2d | nn.Linear):
+        nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+        nn.init.zeros_(module.bias)
 
 
 def quantise(attractor: Tensor, levels: Tensor) -> Tensor:

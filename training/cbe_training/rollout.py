@@ -1,4 +1,4 @@
-"""Lock-step rollouts: behaviors are shown, then repeated from jittered starts (paper, Sec. IV-A)."""
+"""Lock-step rollouts: behaviors are shown, then repeated from jittered starts (Sec. IV-A)."""
 
 from dataclasses import dataclass
 
@@ -59,9 +59,7 @@ class Rollouts:
     success: NDArray[np.bool_]  # arrived within 0.5 m and 30 deg, without collision
 
 
-def show(
-    drives: Drives, count: int, frames: int, gap: int, rng: np.random.Generator
-) -> Behaviors:
+def show(drives: Drives, count: int, frames: int, gap: int, rng: np.random.Generator) -> Behaviors:
     """Cut `count` behaviors of `frames` frames out of random drives and look along them."""
     steps = (frames - 1) * gap + 1
     long_enough = np.array([i for i, poses in enumerate(drives.poses) if len(poses) > steps])
@@ -105,7 +103,9 @@ def roll_out(
     paths, world = behaviors.paths.take(shown), behaviors.world[shown]
     driven = shown.copy()
     wrong = rng.random(count) < (config.wrong_episodes if training else 0.0)
-    shown = np.where(wrong, (shown + 1 + rng.integers(0, len(behaviors.world) - 1)) % len(behaviors.world), shown)
+    shown = np.where(
+        wrong, (shown + 1 + rng.integers(0, len(behaviors.world) - 1)) % len(behaviors.world), shown
+    )
     wrong = behaviors.world[shown] != world  # the same world could overlap
     shown = np.where(wrong, shown, driven)
     joining = (rng.random(count) < (config.joining_episodes if training else 0.0)) & ~wrong
@@ -168,7 +168,11 @@ def roll_out(
 
 
 def _empty(
-    count: int, longest: int, behaviors: Behaviors, shown: NDArray[np.int64], driven: NDArray[np.int64]
+    count: int,
+    longest: int,
+    behaviors: Behaviors,
+    shown: NDArray[np.int64],
+    driven: NDArray[np.int64],
 ) -> Rollouts:
     return Rollouts(
         images=np.zeros((count, longest, *behaviors.images.shape[2:]), np.uint8),

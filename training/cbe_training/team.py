@@ -5,13 +5,16 @@ rendering and rollouts parallelise as well.
 """
 
 import os
+import signal
+import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numba
 import torch
-from torch import distributed, multiprocessing
+from torch import distributed
+from torch.multiprocessing.spawn import start_processes
 
 
 class Team:
@@ -54,8 +57,11 @@ def run(work: Callable[[Team], None], size: int) -> None:
     if size == 1:
         work(Team())
         return
+    # Daemons end with this process; a plain SIGTERM would leave them training on.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     with tempfile.TemporaryDirectory() as folder:
-        multiprocessing.spawn(_join, args=(size, Path(folder) / "meeting", work), nprocs=size)
+        arguments = (size, Path(folder) / "meeting", work)
+        start_processes(_join, arguments, nprocs=size, daemon=True, start_method="spawn")
 
 
 def _join(rank: int, size: int, meeting: Path, work: Callable[[Team], None]) -> None:
