@@ -63,4 +63,4 @@ def free_length(
     """
     reach = np.sqrt(np.maximum(radius_m**2 - across_m**2, 0.0))
     hit = (along_m > 0.0) & (across_m < radius_m)
-    return np.where(hit, along_m - reach, np.inf).min(axis=-1)
+    return np.asarray(np.where(hit, along_m - reach, np.inf).min(axis=-1))

@@ -50,6 +50,7 @@ class RmpGains:
     manoeuvres: ManoeuvreGains = field(default_factory=ManoeuvreGains)
     waypoint_speed_per_s: float = 3.0  # speed allowed per metre of distance to the waypoint
     arrived_m: float = 0.03
+    slipped_m: float = 0.2  # a waypoint behind the axle but this near has been reached
     braking_mps2: float = 1.0  # comfortable, half of what the robot can do
     tight_speed_mps: float = 0.2  # at no clearance, rising to full speed at
     open_clearance_m: float = 0.1
@@ -138,8 +139,7 @@ class RmpController:
         present = np.tan(motion.steer_rad) / robot.wheelbase_m
         choice = self._manoeuvres.choose(toward, present, waypoint, points)
         speed = np.where(distance < gains.arrived_m, 0.0, gains.waypoint_speed_per_s * distance)
-        # A near waypoint that has slipped behind the axle has been reached.
-        speed = np.where((waypoint[:, 0] <= 0.0) & (distance < 0.15), 0.0, speed)
+        speed = np.where((waypoint[:, 0] <= 0.0) & (distance < gains.slipped_m), 0.0, speed)
         speed = np.minimum(speed, np.sqrt(2.0 * gains.braking_mps2 * choice.free_m))
         openness = _within(choice.clearance_m / gains.open_clearance_m, 0.0, 1.0)
         tight = gains.tight_speed_mps
@@ -200,10 +200,10 @@ class RmpController:
 
 
 def _within(
-    value: NDArray[np.floating], low: NDArray[np.floating] | float, high: float
-) -> NDArray[np.floating]:
+    value: NDArray[np.float64], low: NDArray[np.float64] | float, high: float
+) -> NDArray[np.float64]:
     """Clip; np.clip costs five times as much on a single robot's arrays."""
-    return np.minimum(np.maximum(value, low), high)
+    return np.asarray(np.minimum(np.maximum(value, low), high))
 
 
 def _curvature_to(

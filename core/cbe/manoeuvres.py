@@ -25,7 +25,8 @@ class ManoeuvreGains:
 
     first_arcs: int = 11
     second_arcs: int = 7
-    horizon_per_m: float = 2.0  # length that counts, per metre to the waypoint
+    near_waypoint_m: float = 0.35  # from here on, way beyond the waypoint counts
+    beyond_per_m: float = 3.0  # so much, per metre
     wanted_clearance_m: float = 0.2  # between body and obstacle
     least_clearance_m: float = 0.03
     miss_weight_per_m: float = 1.0  # nearest distance to the waypoint
@@ -93,10 +94,10 @@ class Manoeuvres:
         miss = np.sqrt((off[:, 0] + off[:, 1])[:, self._samples].min(axis=1))  # (B, T + 1)
 
         distance = np.hypot(waypoint_m[:, 0], waypoint_m[:, 1]).astype(np.float32)
-        horizon = np.minimum(
-            gains.horizon_per_m * distance + np.float32(SPACING_M), self._travelled[-1]
-        )[:, None]
-        minded = self._travelled <= horizon  # (B, 10)
+        # A waypoint nearer than usual is the goal: nothing behind it matters.
+        beyond = gains.beyond_per_m * np.maximum(distance - gains.near_waypoint_m, 0.0)
+        horizon = np.minimum(distance + beyond, self._travelled[-1])[:, None]
+        minded = self._travelled <= horizon + np.float32(0.5 * SPACING_M)  # (B, 10)
         sample[~minded] = _OPEN_M
         clearance = sample.min(axis=1)  # (B, T + 1)
         first_hit = (sample < gains.least_clearance_m).argmax(axis=1)
@@ -107,7 +108,7 @@ class Manoeuvres:
         first[:, :-1], first[:, -1] = self._first, toward_per_m
         short = 1.0 - clearance / gains.wanted_clearance_m
         short = np.minimum(np.maximum(short, 0.0), 1.5)
-        blocked = np.maximum(1.0 - free / horizon, 0.0)
+        blocked = np.maximum(1.0 - free / np.maximum(horizon, SPACING_M), 0.0)
         change = gains.toward_weight * np.abs(first - toward_per_m[:, None])
         change += gains.change_weight * np.abs(first - present_per_m[:, None])
         cost = change / self._robot.max_curvature_per_m + gains.miss_weight_per_m * miss

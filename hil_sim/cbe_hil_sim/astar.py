@@ -12,6 +12,7 @@ COARSENING = 2  # cells of the world to one cell of the search
 COMFORT_M = 0.45  # nothing is gained by more distance to walls
 WALL_COST = 12.0
 SPACING_M = 0.05
+SNAP_CELLS = 2  # how far a start or goal may lie from passable cells
 SMOOTHING_M = 0.25  # makes corners driveable at a turning radius of 0.43 m
 _SMOOTHING_ROUNDS = 12
 
@@ -31,8 +32,9 @@ class GoalField:
         nearness = np.clip((COMFORT_M - coarse) / COMFORT_M, 0.0, 1.0)
         cost = np.where(coarse >= clearance_m, 1.0 + WALL_COST * nearness**2, -1.0)
         self._mcp = MCP_Geometric(cost)  # negative costs are impassable
-        goal = self._cell(self.goal_m)
-        if cost[goal] < 0.0:
+        self._passable = cost > 0.0
+        goal = self._nearest_passable(self.goal_m)
+        if goal is None:
             raise WorldError(
                 f"goal {tuple(self.goal_m.round(2))} lies within {clearance_m} m of an obstacle "
                 f"in world {world.name!r}; choose a free goal or lower the clearance"
@@ -47,8 +49,8 @@ class GoalField:
 
     def path(self, start_m: NDArray[np.floating]) -> NDArray[np.float64]:
         """Smooth path (N, 2) from `start_m` (2,) to the goal, a point each 0.05 m."""
-        cell = self._cell(start_m)
-        if not np.isfinite(self.cost_m[cell]):
+        cell = self._nearest_passable(np.asarray(start_m))
+        if cell is None or not np.isfinite(self.cost_m[cell]):
             raise WorldError(
                 f"no way from {tuple(np.round(start_m, 2))} to {tuple(self.goal_m.round(2))} in "
                 f"world {self.world.name!r} with clearance {self._clearance_m} m"
@@ -81,9 +83,16 @@ class GoalField:
         rows, columns = self.world.solid_top_m.shape
         return -(-rows // COARSENING), -(-columns // COARSENING)
 
-    def _cell(self, point_m: NDArray[np.floating]) -> tuple[int, int]:
-        row, column = self._cells(np.asarray(point_m))
-        return int(row), int(column)
+    def _nearest_passable(self, point_m: NDArray[np.floating]) -> tuple[int, int] | None:
+        """Passable cell nearest to a point (2,), for those that stand a little too close."""
+        row, column = self._cells(point_m)
+        low = np.maximum([row - SNAP_CELLS, column - SNAP_CELLS], 0)
+        window = self._passable[low[0] : row + SNAP_CELLS + 1, low[1] : column + SNAP_CELLS + 1]
+        free = np.argwhere(window) + low  # (N, 2)
+        if len(free) == 0:
+            return None
+        nearest = free[((free - [row, column]) ** 2).sum(axis=1).argmin()]
+        return int(nearest[0]), int(nearest[1])
 
 
 def plan(

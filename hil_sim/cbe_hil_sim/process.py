@@ -271,8 +271,11 @@ class RobotProcess:
             poses.append(self._truth["pose"])
             clearance_m = min(clearance_m, self._truth["clearance_m"] or math.inf)
             twist = driver.command(self._world.backend.poses, seen)
-            if twist is None or self._truth["collided"] or self._exiting.is_set():
+            if twist is None or self._truth["collided"]:
                 reason = "arrived" if twist is None else "collision"
+                break
+            if self._exiting.is_set():
+                reason = "the simulator is ending"
                 break
             self._advance(float(twist[0][0]), float(twist[1][0]))
             self._exiting.wait(max(due_s - time.monotonic(), 0.0))
