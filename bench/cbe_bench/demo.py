@@ -8,24 +8,20 @@ import math
 import signal
 import sys
 import time
-from concurrent.futures import Future
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from threading import Thread
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from tqdm import tqdm
 
 from cbe.errors import CbeError, LinkError
 from cbe.link import Link
 from cbe.linkconfig import LinkConfig
-from cbe.robot import STEP_S, Robot
-from cbe_bench.demo_course import Course, bin_place, choose, jittered
-from cbe_bench.demo_processes import Child, Crew, OverdueError, ProcessError, free_port
-from cbe_bench.demo_report import ARRIVED, Drive, Repetition, Report
-from cbe_bench.demo_witness import Witness, along
+from cbe_bench.demo_course import Course, choose
+from cbe_bench.demo_processes import Child, Crew, free_port
+from cbe_bench.demo_report import Report
+from cbe_bench.demo_stage import DemoConfig, Stage
+from cbe_bench.demo_witness import Witness
 from cbe_hil_sim.generate import TEST_SEEDS, generate
 from cbe_runtime import routefile
 
@@ -34,30 +30,7 @@ if TYPE_CHECKING:
 
     from cbe_hil_sim.world import World
 
-SIM_START_S, DRIVE_S, TEACH_S = 60.0, 90.0, 60.0  # deadlines, far beyond what is usual
-RECORDER_START_S = 15.0
-REPEAT_FACTOR, REPEAT_EXTRA_S = 1.6, 15.0  # times the demonstration's own time
-OFF_ROUTE_M = 1.5
-STUCK_M, STUCK_STEPS = 0.1, 120
-EXIT_STOPPED = 3
-POLL_S = 0.05
-
-
-@dataclass(frozen=True, slots=True)
-class DemoConfig:
-    """What to show; `model` None means the shipped one."""
-
-    seed: int
-    scene: Path | None
-    obstacle: bool
-    fast: bool
-    folder: Path
-    model: Path | None
-
-    @property
-    def model_options(self) -> tuple[str, ...]:
-        """Command-line options that choose the model."""
-        return () if self.model is None else ("--model", str(self.model))
+SIM_START_S = 60.0
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -66,6 +39,9 @@ def main(arguments: list[str] | None = None) -> int:
     config = DemoConfig(
         options.seed, options.scene, options.obstacle, options.fast, options.out, options.model
     )
+    if config.seed not in range(len(TEST_SEEDS)):
+        sys.stderr.write(f"demo: --seed must be 0 to {len(TEST_SEEDS) - 1}; found {config.seed}\n")
+        return 2
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         return 0 if run(config) else 1
@@ -94,7 +70,7 @@ def run(config: DemoConfig) -> bool:
         with _step("1/5 simulator") as advance:
             link = _connected(endpoint, sim, advance)
         with link, Witness(link) as witness:
-            stage = _Stage(config, crew, link, witness, sim, endpoint)
+            stage = Stage(config, crew, link, witness, sim, endpoint)
             with _step("2/5 demonstration") as advance:
                 drive = stage.demonstrate(course, advance)
             with _step("3/5 teaching") as advance:
@@ -111,171 +87,6 @@ def run(config: DemoConfig) -> bool:
     sys.stdout.write(f"\n{report.table()}  {'whole time':<18} {time.monotonic() - began_s:.0f} s\n")
     sys.stdout.write(f"pictures and recordings are in {config.folder}/\n")
     return report.succeeded
-
-
-class _Stage:
-    """The acts, in order, on one simulator."""
-
-    def __init__(
-        self,
-        config: DemoConfig,
-        crew: Crew,
-        link: Link,
-        witness: Witness,
-        sim: Child,
-        endpoint: str,
-    ) -> None:
-        self._config = config
-        self._crew = crew
-        self._link = link
-        self._witness = witness
-        self._sim = sim
-        self._endpoint = endpoint
-
-    def demonstrate(self, course: Course, advance: Callable[[float], None]) -> Drive:
-        """Let the simulator's demonstrator drive the course while it is recorded."""
-        recording = self._config.folder / "drive.mcap"
-        recorder = self._record(recording, "record-drive")
-        self._witness.restart()
-        request = {"path": course.path.tolist()}
-        driving = _in_background(lambda: self._link.call("drive", request, timeout_s=DRIVE_S))
-        expected = course.length_m / Robot().max_speed_mps / STEP_S
-
-        def driven() -> bool:
-            advance(len(self._witness.truths) / expected)
-            return driving.done()
-
-        self._until(driven, DRIVE_S, "the demonstration to end", recorder)
-        reply = driving.result()
-        self._finish(recorder)
-        if not reply["arrived"]:
-            raise ProcessError(
-                f"the demonstrator did not arrive ({reply['reason']}); choose another seed"
-            )
-        return Drive(np.array(reply["poses"]), reply["stamps_ns"][0], recording, course.doors)
-
-    def teach(self, drive: Drive, advance: Callable[[float], None]) -> Path:
-        """Turn the recording into a route."""
-        route = self._config.folder / "route.msgpack"
-        teacher = self._crew.start(
-            "cbe-teach", str(drive.recording), "-o", str(route), *self._config.model_options
-        )
-        usual_s = 1.0 + 0.01 * len(drive.poses)
-        began_s = time.monotonic()
-
-        def taught() -> bool:
-            advance(min((time.monotonic() - began_s) / usual_s, 0.99))
-            return teacher.returncode is not None
-
-        self._until(taught, TEACH_S, "cbe-teach to end")
-        if teacher.returncode != 0:
-            raise ProcessError(f"cbe-teach refused:\n{teacher.tail()}")
-        return route
-
-    def repeat(
-        self, world: World, drive: Drive, route: Path, advance: Callable[[float], None]
-    ) -> Repetition:
-        """Put the robot back near the start and let the runtime drive."""
-        config, obstacle_m = self._config, None
-        if config.obstacle:
-            place = bin_place(world, drive.poses, config.seed)
-            self._link.call("obstacle", {"pose": place.tolist()}, timeout_s=30.0)
-            obstacle_m = (float(place[0]), float(place[1]))
-        start = jittered(world, drive.poses[0], config.seed)
-        self._link.call("reset", {"pose": start.tolist()}, timeout_s=30.0)
-        recording = config.folder / "repeat.mcap"
-        recorder = self._record(recording, "record-repeat")
-        self._witness.restart()
-        clock = ("--clock", "sim") if config.fast else ()
-        runtime = self._crew.start(
-            "cbe-runtime", "--memory", str(route), "--connect", self._endpoint,
-            "--exit-when-done", *clock, *config.model_options,
-        )  # fmt: skip
-        ended = self._watch(runtime, drive, advance)
-        self._finish(recorder)
-        truths = self._witness.truths
-        if not truths:
-            raise ProcessError("the simulator told no truth; see its log")
-        return Repetition(ended, truths, self._witness.statuses, recording, obstacle_m)
-
-    def _watch(self, runtime: Child, drive: Drive, advance: Callable[[float], None]) -> str:
-        """ARRIVED, or why the repetition ended."""
-        limit_s = REPEAT_FACTOR * len(drive.poses) * STEP_S + REPEAT_EXTRA_S
-        verdict = ""
-
-        def ended() -> bool:
-            nonlocal verdict
-            truths = self._witness.truths
-            poses = np.array([truth.pose for truth in truths]).reshape(-1, 3)
-            share, off_m = along(drive.poses, poses)
-            if runtime.returncode is not None:
-                verdict = self._last_word(runtime)
-            elif not len(poses):
-                return False
-            elif truths[-1].collided:
-                verdict = "COLLISION"
-            elif off_m[-1] > OFF_ROUTE_M:
-                verdict = "OFF ROUTE"
-            elif self._stuck(poses):
-                verdict = "STUCK"
-            else:
-                advance(float(share[-1]))
-            return bool(verdict)
-
-        try:
-            self._until(ended, limit_s, "the repetition to end")
-        except OverdueError:
-            verdict = "TIMEOUT"
-        if runtime.returncode is None:
-            runtime.finish()
-        return verdict
-
-    def _stuck(self, poses: np.ndarray[Any, np.dtype[np.float64]]) -> bool:
-        """Whether the robot has stood for long since the runtime began to drive."""
-        if not self._witness.statuses or len(poses) < STUCK_STEPS:
-            return False
-        recent = poses[-STUCK_STEPS:, :2]
-        return bool(np.hypot(*(recent - recent[0]).T).max() < STUCK_M)
-
-    def _last_word(self, runtime: Child) -> str:
-        if runtime.returncode == 0:
-            return ARRIVED
-        reasons = [status.reason for status in self._witness.statuses if status.reason]
-        if runtime.returncode == EXIT_STOPPED and reasons:
-            return f"STOPPED ({reasons[-1]})"
-        raise ProcessError(f"cbe-runtime ended with code {runtime.returncode}:\n{runtime.tail()}")
-
-    def _record(self, path: Path, log: str) -> Child:
-        """Start recording; returns once it listens."""
-        recorder = self._crew.start(
-            "cbe-record", "-o", str(path), "--connect", self._endpoint, log=log
-        )
-        self._until(
-            lambda: self._link.alive("record"), RECORDER_START_S, "cbe-record to start", recorder
-        )
-        return recorder
-
-    def _finish(self, recorder: Child) -> None:
-        if recorder.finish() != 0:
-            raise ProcessError(f"cbe-record failed:\n{recorder.tail()}")
-        self._until(
-            lambda: not self._link.alive("record"), RECORDER_START_S, "cbe-record to be gone"
-        )
-
-    def _until(self, done: Callable[[], bool], timeout_s: float, what: str, *needed: Child) -> None:
-        """Poll `done` while the simulator and what else is needed live.
-
-        Raises:
-            ProcessError: one of them ended.
-            OverdueError: it takes too long.
-        """
-        deadline_s = time.monotonic() + timeout_s
-        while not done():
-            for child in (self._sim, *needed):
-                child.require_running()
-            if time.monotonic() > deadline_s:
-                raise OverdueError(f"waited {timeout_s:.0f} s in vain for {what}")
-            time.sleep(POLL_S)
 
 
 def _world(config: DemoConfig) -> World:
@@ -311,20 +122,6 @@ def _connected(endpoint: str, sim: Child, advance: Callable[[float], None]) -> L
         except LinkError:
             if time.monotonic() - began_s > SIM_START_S:
                 raise
-
-
-def _in_background(call: Callable[[], dict[str, Any]]) -> Future[dict[str, Any]]:
-    """The result of a call that another thread makes; that thread never holds up an exit."""
-    future: Future[dict[str, Any]] = Future()
-
-    def work() -> None:
-        try:
-            future.set_result(call())
-        except CbeError as error:
-            future.set_exception(error)
-
-    Thread(target=work, daemon=True).start()
-    return future
 
 
 @contextmanager

@@ -62,7 +62,7 @@ class Repetition:
     truths: Sequence[Truth]
     statuses: Sequence[Status]
     recording: Path
-    obstacle_m: tuple[float, float] | None
+    bin_pose: tuple[float, float, float] | None
 
     @property
     def poses(self) -> NDArray[np.float64]:
@@ -129,7 +129,7 @@ class Report:
         at_joints = moving[np.rint(shares * (len(moving) - 1)).astype(int), :2]
         pictures.overview(
             folder / "overview.png", world, demonstration, repeated, at_joints,
-            self.repetition.obstacle_m, f"{world.name}: {self.outcome}",
+            self.repetition.bin_pose, f"{world.name}: {self.outcome}",
         )  # fmt: skip
         done()
         stamps, believed = self._believed(shares)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
+from matplotlib.patches import Rectangle
 
 from cbe_bench.demo_course import doorways
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from cbe_hil_sim.world import World
 
-MARGIN_M = 1.0
+MARGIN_M, BIN_M = 2.0, 0.3
 FLOOR, FURNITURE, WALL, DOORWAY = (252, 251, 248), (205, 184, 152), (68, 70, 78), (226, 236, 226)
 TAUGHT, REPEATED, ATTRACTOR, OBSTACLE = "#3465a4", "#d9480f", "#2b8a3e", "#111111"
 
@@ -30,7 +30,7 @@ def overview(
     demonstration: NDArray[np.floating],
     repetition: NDArray[np.floating],
     joints_m: NDArray[np.floating],
-    obstacle_m: tuple[float, float] | None,
+    bin_pose: tuple[float, float, float] | None,
     title: str,
 ) -> None:
     """Write the view from above.
@@ -41,13 +41,18 @@ def overview(
         demonstration: true poses (T, 3) of the taught drive.
         repetition: true poses (N, 3) of the repeated one.
         joints_m: where the attractors were taken, (K, 2).
-        obstacle_m: centre of the bin, where there is one.
+        bin_pose: centre and heading of the bin, where there is one.
         title: written above.
     """
-    figure = Figure(figsize=(9.0, 8.0), layout="constrained")
-    axes = figure.subplots()
     x0, y0 = world.origin_m
     width, height = world.size_m
+    drawn = np.concatenate([demonstration[:, :2], repetition[:, :2]])
+    low = np.maximum(drawn.min(axis=0) - MARGIN_M, (x0, y0))
+    high = np.minimum(drawn.max(axis=0) + MARGIN_M, (x0 + width, y0 + height))
+    shape = (high[1] - low[1]) / (high[0] - low[0])
+    tall = min(max(float(shape), 0.4), 1.4)
+    figure = Figure(figsize=(9.0, 9.0 * tall + 0.7), layout="constrained")
+    axes = figure.subplots()
     axes.imshow(_plan(world), origin="lower", extent=(x0, x0 + width, y0, y0 + height))
     axes.plot(*demonstration[:, :2].T, color=TAUGHT, lw=2.5, alpha=0.8, label="demonstration")
     axes.plot(*repetition[:, :2].T, color=REPEATED, lw=1.6, label="repetition")
@@ -57,13 +62,8 @@ def overview(
         _arrow(axes, repetition[0], REPEATED)
         axes.plot(*repetition[-1, :2], "o", color=REPEATED, ms=7, zorder=5)
     axes.plot(*demonstration[-1, :2], "*", color=TAUGHT, ms=14, zorder=4, label="goal")
-    if obstacle_m is not None:
-        axes.add_patch(Circle(obstacle_m, 0.15, color=OBSTACLE, zorder=3, label="obstacle"))
-    drawn = np.concatenate([demonstration[:, :2], repetition[:, :2]])
-    low = np.maximum(drawn.min(axis=0) - 2.0 * MARGIN_M, (x0 - MARGIN_M, y0 - MARGIN_M))
-    high = np.minimum(
-        drawn.max(axis=0) + 2.0 * MARGIN_M, (x0 + width + MARGIN_M, y0 + height + MARGIN_M)
-    )
+    if bin_pose is not None:
+        axes.add_patch(_square(bin_pose))
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x (m)", ylabel="y (m)")
     axes.set_title(title)
     axes.legend(loc="best", fontsize=8, framealpha=0.9)
@@ -77,6 +77,15 @@ def _plan(world: World) -> NDArray[np.uint8]:
     image[world.blocked] = FURNITURE
     image[world.solid_top_m >= min(world.ceiling_m - 0.1, 2.1)] = WALL
     return image
+
+
+def _square(pose: tuple[float, float, float]) -> Rectangle:
+    x, y, yaw = pose
+    corner = (x - 0.5 * BIN_M, y - 0.5 * BIN_M)
+    return Rectangle(
+        corner, BIN_M, BIN_M, angle=float(np.degrees(yaw)), rotation_point="center",
+        color=OBSTACLE, zorder=3, label="bin",
+    )  # fmt: skip
 
 
 def _arrow(axes: Axes, pose: NDArray[np.floating], color: str) -> None:

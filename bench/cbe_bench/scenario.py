@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cbe.errors import WorldError
 from cbe.robot import STEP_S, Robot
 from cbe_bench.place import Bin, Place
-from cbe_hil_sim.astar import GoalField
+from cbe_hil_sim.astar import SPACING_M, GoalField
 from cbe_hil_sim.demonstrator import ENDPOINT_CLEARANCE_M, demonstrate, sample_routes
 from cbe_hil_sim.world import World
 
@@ -25,7 +25,8 @@ BIN_MARGIN_SAMPLES = 10
 BIN_PASSAGE_M = 0.6
 _LEAD_M, _TAIL_M = 1.5, 6.0  # a route is longer than the drive by something between
 _ROUNDS, _WORLDS, _TRIES = 6, 4, 100
-_STRAIGHT_ON_RAD = math.radians(75.0)  # a tour's next leg turns no more than this
+_LEG_POINTS, _LEG_TRIES = 20, 8
+_STRAIGHT_ON_RAD = math.radians(100.0)  # a tour's next leg turns no more than this
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,24 +184,28 @@ def _route(terms: Terms, world: World, rng: np.random.Generator) -> NDArray[np.f
 
 def _tour(world: World, rng: np.random.Generator, length_m: float) -> NDArray[np.float64] | None:
     """A path (N, 2) through several random places, for worlds too small for a longer way."""
-    free = np.argwhere(world.clearance_m >= ENDPOINT_CLEARANCE_M)[:, ::-1]
-    if len(free) == 0:
+    roomy = world.clearance_m[world.clearance_m >= ENDPOINT_CLEARANCE_M]
+    if len(roomy) == 0:
         return None
+    # Legs end in the middle of rooms, where there is space to go on in an arc.
+    free = np.argwhere(world.clearance_m >= np.quantile(roomy, 0.6))[:, ::-1]
     places = (free + 0.5) * world.resolution_m + np.array(world.origin_m)  # (N, 2)
-    legs: list[NDArray[np.float64]] = []
-    here, done_m = rng.choice(places), 0.0
+    start, legs, refused = rng.choice(places), list[NDArray[np.float64]](), 0
     for _ in range(_TRIES):
+        here = legs[-1][-1] if legs else start
         field = GoalField(world, rng.choice(places))
-        if not np.isfinite(field.cost_at(here[None])[0]):
+        reachable = np.isfinite(field.cost_at(here[None])[0])
+        leg = field.path(here) if reachable else here[None]
+        if len(leg) >= _LEG_POINTS and (not legs or _turn(legs[-1], leg) <= _STRAIGHT_ON_RAD):
+            legs.append(leg)
+            refused = 0
+            if sum(map(len, legs)) * SPACING_M >= length_m:
+                return np.concatenate(legs)
             continue
-        leg = field.path(here)
-        if len(leg) < 20 or (legs and _turn(legs[-1], leg) > _STRAIGHT_ON_RAD):
-            continue
-        legs.append(leg)
-        here = leg[-1]
-        done_m += float(np.hypot(*np.diff(leg, axis=0).T).sum())
-        if done_m >= length_m:
-            return np.concatenate(legs)
+        refused += 1
+        if refused >= _LEG_TRIES:  # a dead end: the last leg leads into a corner
+            start, refused = rng.choice(places) if not legs else start, 0
+            del legs[-1:]
     return None
 
 

@@ -141,7 +141,7 @@ class RmpController:
         speed = np.where(distance < gains.arrived_m, 0.0, gains.waypoint_speed_per_s * distance)
         speed = np.where((waypoint[:, 0] <= 0.0) & (distance < gains.slipped_m), 0.0, speed)
         speed = np.minimum(speed, np.sqrt(2.0 * gains.braking_mps2 * choice.free_m))
-        openness = _within(choice.clearance_m / gains.open_clearance_m, 0.0, 1.0)
+        openness = np.minimum(np.maximum(choice.clearance_m / gains.open_clearance_m, 0.0), 1.0)
         tight = gains.tight_speed_mps
         speed = np.minimum(speed, tight + (robot.max_speed_mps - tight) * openness)
         return choice.curvature_per_m, np.minimum(speed, robot.max_speed_mps)

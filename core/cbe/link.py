@@ -181,8 +181,6 @@ class Link:
             key,
             # BLOCK would stall a put for 5 s on a subscriber that has stopped.
             congestion_control=zenoh.CongestionControl.DROP,
-            # Sent at once, not after the next batch.
-            express=True,
         )
         return publisher
 

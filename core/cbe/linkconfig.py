@@ -36,7 +36,7 @@ class LinkConfig:
     style: KeyStyle = KeyStyle.RMW_ZENOH
     domain: int = 0
     robot: str = "robot"
-    open_timeout_s: float = 2.0
+    open_timeout_s: float = 3.0
 
     def __post_init__(self) -> None:
         """Check each field and that mode and endpoints agree."""
@@ -92,6 +92,8 @@ class LinkConfig:
             "scouting/gossip/enabled": False,
             # A hung neighbour is noticed after 2 s instead of 10 s.
             "transport/link/tx/lease": 2000,
+            # Two, the default, let a starved processor drop what one burst holds.
+            "transport/link/tx/queue/size/data": 8,
             "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
             # It gains nothing at these sizes and costs a pool of 16 MiB.
             "transport/shared_memory/enabled": False,

@@ -48,9 +48,7 @@ class Car:
         with tempfile.TemporaryDirectory(prefix="cbe-car-") as folder:
             path = Path(folder) / "car.urdf"
             path.write_text(_urdf(robot))
-            self.body: int = pybullet.loadURDF(
-                str(path), useFixedBase=True, physicsClientId=client
-            )
+            self.body: int = pybullet.loadURDF(str(path), useFixedBase=True, physicsClientId=client)
         count = pybullet.getNumJoints(self.body, physicsClientId=client)
         names = [
             pybullet.getJointInfo(self.body, joint, physicsClientId=client)[1].decode()
@@ -118,13 +116,9 @@ class Car:
         sides = (0.5 * _TRACK_M, -0.5 * _TRACK_M)  # left, right
         # Each wheel rolls about the one centre of the turn.
         rolling = [self._speed_mps * (1.0 - curvature * y) / _WHEEL_RADIUS_M for y in sides]
-        angles = [
-            math.atan(robot.wheelbase_m * curvature / (1.0 - curvature * y)) for y in sides
-        ]
+        angles = [math.atan(robot.wheelbase_m * curvature / (1.0 - curvature * y)) for y in sides]
         self._motors(_REAR, pybullet.VELOCITY_CONTROL, _DRIVE_TORQUE_NM, targetVelocities=rolling)
-        self._motors(
-            _KNUCKLES, pybullet.POSITION_CONTROL, _STEER_TORQUE_NM, targetPositions=angles
-        )
+        self._motors(_KNUCKLES, pybullet.POSITION_CONTROL, _STEER_TORQUE_NM, targetPositions=angles)
 
     def _motors(
         self, names: tuple[str, ...], mode: int, torque_nm: float, **targets: list[float]
@@ -141,9 +135,7 @@ class Car:
         return [(state[0], state[1]) for state in states]
 
     def _filter(self, body: int, link: int, group: int, mask: int) -> None:
-        pybullet.setCollisionFilterGroupMask(
-            body, link, group, mask, physicsClientId=self._client
-        )
+        pybullet.setCollisionFilterGroupMask(body, link, group, mask, physicsClientId=self._client)
 
 
 def _clip(value: float, low: float, high: float) -> float:

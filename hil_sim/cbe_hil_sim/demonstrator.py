@@ -21,6 +21,7 @@ from cbe_hil_sim.worldbatch import WorldBatch
 LOOK_AHEAD_M = 0.55
 ARRIVED_M = 0.2
 ARRIVED_SPEED_MPS = 0.05
+STUCK_STEPS = 30
 ENDPOINT_CLEARANCE_M = 0.3
 PATH_CLEARANCE_M = 0.17
 _STARTS_PER_GOAL = 4
@@ -142,8 +143,9 @@ def demonstrate(
 ) -> list[Demonstration]:
     """Drive all paths, path b in `worlds[world_index[b]]`; drives that fail are left out.
 
-    A drive fails by touching something or by not arriving in three times the time its path
-    would take at full speed. `batch` is `WorldBatch.pack(worlds)`. `noise` as in `Vehicle`.
+    A drive fails by touching something, by standing still for 3 s or by not arriving in three
+    times the time its path would take at full speed. `batch` is `WorldBatch.pack(worlds)`,
+    `noise` as in `Vehicle`.
     """
     controller = controller or RmpController(robot)
     clearance = Clearance(worlds)
@@ -156,6 +158,7 @@ def demonstrate(
     steps = int(deadline.max()) + 1
     log = np.zeros((len(paths), steps, 6))  # x, y, yaw, speed, steering, clearance
     drives: list[Demonstration] = []
+    still = np.zeros(len(paths), np.int64)
     commanded = vehicle.motion
     for step in range(steps):
         body = clearance.at(where, vehicle.poses[:, :2]) - robot.body_radius_m
@@ -178,9 +181,11 @@ def demonstrate(
                     min_clearance_m=float(part[:, 5].min()),
                 )
             )
-        going = ~arrived & (body >= 0.0) & (step < deadline[active])
+        still = np.where(resting, still + 1, 0)
+        going = ~arrived & (body >= 0.0) & (step < deadline[active]) & (still < STUCK_STEPS)
         if not going.all():
             active, where, waypoint = active[going], where[going], waypoint[going]
+            still = still[going]
             follower.keep(going)
             vehicle.keep(going)
             commanded = Motion(commanded.speed_mps[going], commanded.steer_rad[going])

@@ -63,16 +63,20 @@ class Patch:
             path = str(Path(folder) / "texture.bmp")
             cv2.imwrite(path, self.image[..., ::-1])
             texture = pybullet.loadTexture(path, physicsClientId=client)
-        for part in _parts(len(self.corners_m)):
-            corners = self.corners_m[part]
+        all_corners, all_uv = self.corners_m, self.uv
+        if double_sided:
+            # Bullet's own flag for it has no effect on TinyRenderer, which culls the backs.
+            all_corners = np.concatenate([all_corners, all_corners[:, ::-1]])
+            all_uv = np.concatenate([all_uv, all_uv[:, ::-1]])
+        for part in _parts(len(all_corners)):
+            corners = all_corners[part]
             shape = pybullet.createVisualShape(
                 pybullet.GEOM_MESH,
                 vertices=corners.reshape(-1, 3).tolist(),  # (T * 3, 3)
-                uvs=self.uv[part].reshape(-1, 2).tolist(),  # (T * 3, 2)
+                uvs=all_uv[part].reshape(-1, 2).tolist(),  # (T * 3, 2)
                 normals=np.repeat(_normals(corners), 3, axis=0).tolist(),
                 indices=list(range(3 * len(corners))),
                 rgbaColor=[1.0, 1.0, 1.0, 1.0],
-                flags=pybullet.VISUAL_SHAPE_DOUBLE_SIDED if double_sided else 0,
                 physicsClientId=client,
             )
             body = pybullet.createMultiBody(
