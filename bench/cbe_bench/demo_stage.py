@@ -174,7 +174,10 @@ class Stage:
 
     def _stuck(self, poses: NDArray[np.float64]) -> bool:
         """Whether the robot has stood for long since the runtime began to drive."""
-        if not self._witness.statuses or len(poses) < STUCK_STEPS:
+        statuses, truths = self._witness.statuses, self._witness.truths
+        # A runtime that is slow to start is not stuck.
+        driven_ns = truths[-1].stamp_ns - statuses[0].stamp_ns if statuses else 0
+        if driven_ns * 1e-9 < STUCK_STEPS * STEP_S:
             return False
         recent = poses[-STUCK_STEPS:, :2]
         return bool(np.hypot(*(recent - recent[0]).T).max() < STUCK_M)

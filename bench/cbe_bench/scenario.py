@@ -25,8 +25,8 @@ BIN_MARGIN_SAMPLES = 10
 BIN_PASSAGE_M = 0.6
 _LEAD_M, _TAIL_M = 1.5, 6.0  # a route is longer than the drive by something between
 _ROUNDS, _WORLDS, _TRIES = 6, 4, 100
-_LEG_POINTS, _LEG_TRIES = 20, 8
-_STRAIGHT_ON_RAD = math.radians(100.0)  # a tour's next leg turns no more than this
+_LEG_POINTS, _LEG_SHARE, _LEG_TRIES = 20, 0.7, 8
+_SHARPEST_RAD = math.radians(150.0)  # turn from leg to leg; what the car cannot drive, fails
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +187,7 @@ def _tour(world: World, rng: np.random.Generator, length_m: float) -> NDArray[np
     roomy = world.clearance_m[world.clearance_m >= ENDPOINT_CLEARANCE_M]
     if len(roomy) == 0:
         return None
-    # Legs end in the middle of rooms, where there is space to go on in an arc.
+    # Goals are in the middle of rooms and legs end on their way there: there it goes on ahead.
     free = np.argwhere(world.clearance_m >= np.quantile(roomy, 0.6))[:, ::-1]
     places = (free + 0.5) * world.resolution_m + np.array(world.origin_m)  # (N, 2)
     start, legs, refused = rng.choice(places), list[NDArray[np.float64]](), 0
@@ -196,8 +196,8 @@ def _tour(world: World, rng: np.random.Generator, length_m: float) -> NDArray[np
         field = GoalField(world, rng.choice(places))
         reachable = np.isfinite(field.cost_at(here[None])[0])
         leg = field.path(here) if reachable else here[None]
-        if len(leg) >= _LEG_POINTS and (not legs or _turn(legs[-1], leg) <= _STRAIGHT_ON_RAD):
-            legs.append(leg)
+        if len(leg) >= _LEG_POINTS and (not legs or _turn(legs[-1], leg) <= _SHARPEST_RAD):
+            legs.append(leg[: max(_LEG_POINTS, round(_LEG_SHARE * len(leg)))])
             refused = 0
             if sum(map(len, legs)) * SPACING_M >= length_m:
                 return np.concatenate(legs)

@@ -21,6 +21,7 @@ from cbe.robot import STEP_S, Robot
 
 STANDSTILL_MPS = 0.02  # below it a yaw rate says nothing about the steering
 _POOL = 5  # rays to one point in the controller
+_REAR_POINTS = 4  # on each side, of 48: 100 deg and more from ahead, forward drives only leave them
 _ATTRACTED = 3  # of the control points
 _LEAST_STEERING_SPEED_MPS = 0.15  # keeps the steering's Jacobian regular from standstill
 
@@ -137,7 +138,8 @@ class RmpController:
         distance = np.hypot(waypoint[:, 0], waypoint[:, 1])
         toward = _curvature_to(waypoint, distance, robot.max_curvature_per_m)
         present = np.tan(motion.steer_rad) / robot.wheelbase_m
-        choice = self._manoeuvres.choose(toward, present, waypoint, points)
+        ahead = points[:, _REAR_POINTS:-_REAR_POINTS]
+        choice = self._manoeuvres.choose(toward, present, waypoint, ahead)
         speed = np.where(distance < gains.arrived_m, 0.0, gains.waypoint_speed_per_s * distance)
         speed = np.where((waypoint[:, 0] <= 0.0) & (distance < gains.slipped_m), 0.0, speed)
         speed = np.minimum(speed, np.sqrt(2.0 * gains.braking_mps2 * choice.free_m))

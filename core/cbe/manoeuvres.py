@@ -87,18 +87,20 @@ class Manoeuvres:
         places = np.empty((batch, 2, tree + SAMPLES), np.float32)
         places[:, :, :tree] = self._tree
         places[:, 0, tree:], places[:, 1, tree:] = _arc(toward_per_m, SAMPLES)
-        sample = _nearest_m(places, points_m)[:, self._samples]  # (B, 10, T + 1)
+        sample = _nearest_m(places, points_m).take(self._samples, axis=1)  # (B, 10, T + 1)
         sample -= np.float32(self._robot.body_radius_m)
         off = places - waypoint_m.astype(np.float32)[..., None]
         off *= off
-        miss = np.sqrt((off[:, 0] + off[:, 1])[:, self._samples].min(axis=1))  # (B, T + 1)
+        miss = np.sqrt(
+            (off[:, 0] + off[:, 1]).take(self._samples, axis=1).min(axis=1)
+        )  # (B, T + 1)
 
         distance = np.hypot(waypoint_m[:, 0], waypoint_m[:, 1]).astype(np.float32)
         # A waypoint nearer than usual is the goal: nothing behind it matters.
         beyond = gains.beyond_per_m * np.maximum(distance - gains.near_waypoint_m, 0.0)
         horizon = np.minimum(distance + beyond, self._travelled[-1])[:, None]
         minded = self._travelled <= horizon + np.float32(0.5 * SPACING_M)  # (B, 10)
-        sample[~minded] = _OPEN_M
+        sample += np.where(minded, np.float32(0.0), np.float32(_OPEN_M))[..., None]
         clearance = sample.min(axis=1)  # (B, T + 1)
         first_hit = (sample < gains.least_clearance_m).argmax(axis=1)
         hit = clearance < gains.least_clearance_m

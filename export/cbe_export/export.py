@@ -69,21 +69,29 @@ def export(
     return Exported(model_id, worst, count, sizes)
 
 
+def identify(networks: BehaviorNetworks) -> str:
+    """16 hex digits that change with the weights, the preprocessing or the quantisation."""
+    digest = hashlib.sha256(f"{signature.CONTRACT_VERSION} {_camera()} fp32".encode())
+    for name, value in sorted(networks.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(value.cpu().numpy().tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _camera() -> str:
+    return json.dumps(MODEL_CAMERA.to_dict(), sort_keys=True)
+
+
 def write_graphs(
     networks: BehaviorNetworks, folder: Path, *, network_period: int, segment_steps: int
 ) -> str:
     """Write `encoder.onnx`, `attractor.onnx` and `generator.onnx`; returns the model id."""
-    camera = json.dumps(MODEL_CAMERA.to_dict(), sort_keys=True)
-    digest = hashlib.sha256(f"{signature.CONTRACT_VERSION} {camera} fp32".encode())
-    for name, value in sorted(networks.state_dict().items()):
-        digest.update(name.encode())
-        digest.update(value.cpu().numpy().tobytes())
-    model_id = digest.hexdigest()[:16]
+    model_id = identify(networks)
     values = (
         str(signature.CONTRACT_VERSION),
         model_id,
         str(network_period),
-        camera,
+        _camera(),
         str(segment_steps),
         "fp32",
     )

@@ -81,8 +81,10 @@ class RobotProcess:
         """Declare what is published and served; `exiting` ends `run` when set."""
         self._world, self._robot, self._config = world, robot, config
         self._exiting = exiting
+        self._parent, self._end_s = os.getppid(), math.inf
         self._stamp_ns = STEP_NS
         self._steps = 0
+        self._unanswered = 0
         self._last_poses = world.backend.poses
         self._requests: queue.SimpleQueue[tuple[Handler, JsonObject, Future[JsonObject]]] = (
             queue.SimpleQueue()
@@ -106,18 +108,15 @@ class RobotProcess:
 
     def run(self) -> None:
         """Publish, wait for the command, step; until told to exit, or an orphan."""
-        parent, end_s = os.getppid(), time.monotonic() + self._config.max_s
         due_s = time.monotonic()
+        self._end_s = due_s + self._config.max_s
         try:
-            while not self._exiting.is_set() and time.monotonic() < end_s:
-                if os.getppid() != parent:
-                    logger.warning("the parent process ended; so does the simulator")
-                    break
+            while not self._ending():
                 if self._serve():
                     due_s = time.monotonic()
                 stamp_ns, seen = self._stamp_ns, self._publish()
                 if self._config.lockstep:
-                    twist = self._await_answer(seen, end_s)
+                    twist = self._await_answer(seen)
                 else:
                     due_s = max(due_s + STEP_S, time.monotonic())  # missed deadlines are skipped
                     self._exiting.wait(max(due_s - time.monotonic(), 0.0))
@@ -128,16 +127,25 @@ class RobotProcess:
             self._exiting.set()
             self._refuse_requests()
 
+    def _ending(self) -> bool:
+        """Whether it was told to exit, its time is up, or its parent is gone."""
+        orphaned = os.getppid() != self._parent
+        late = time.monotonic() > self._end_s
+        if (orphaned or late) and not self._exiting.is_set():
+            logger.warning("ending: %s", "the parent process ended" if orphaned else "time is up")
+            self._exiting.set()
+        return self._exiting.is_set()
+
     def _publish(self) -> Observation:
         """Observe and send everything of this step; the camera last, as it sets the pace."""
         seen = self._world.backend.observe()
         self._truth = self._measure()
-        self._truths.put(self._truth)
         self._send(seen, with_info=self._steps % INFO_STEPS == 0)
         return seen
 
     def _send(self, seen: Observation, *, with_info: bool) -> None:
         stamp_ns, image = self._stamp_ns, seen.images[0]
+        self._truths.put(self._truth)
         if with_info:
             self._info.put(CameraInfo.of(self._world.camera, stamp_ns))
         x, y, yaw = self._truth["pose"]
@@ -189,25 +197,25 @@ class RobotProcess:
             return 0.0, 0.0
         return twist.speed_mps, twist.yaw_rate_rad_s
 
-    def _await_answer(self, seen: Observation, end_s: float) -> tuple[float, float] | None:
+    def _await_answer(self, seen: Observation) -> tuple[float, float] | None:
         """The command stamped for this frame; None if something else is due first."""
         assert self._stamped is not None
-        count, unanswered = 0, 0
-        due_s = time.monotonic() + REPUBLISH_S
-        while not self._exiting.is_set() and self._requests.empty():
+        count = 0
+        patience_s = REPUBLISH_S if self._unanswered < ABANDONED else 0.0
+        due_s = time.monotonic() + patience_s
+        while not self._ending() and self._requests.empty():
             received = self._stamped.wait(after=count, timeout_s=POLL_S)
             if received is not None:
                 count = received.count
                 command = received.message
                 if command is not None and command.stamp_ns == self._stamp_ns:
+                    self._unanswered = 0
                     return command.twist.speed_mps, command.twist.yaw_rate_rad_s
             now_s = time.monotonic()
-            if now_s > end_s or os.getppid() == 1:
-                break
             if now_s > due_s:
                 due_s = now_s + REPUBLISH_S
-                unanswered += 1
-                if unanswered >= ABANDONED and abs(self._truth["speed_mps"]) > CALM_MPS:
+                self._unanswered += 1
+                if self._unanswered >= ABANDONED and abs(self._truth["speed_mps"]) > CALM_MPS:
                     logger.warning("no command answers the frames: the robot brakes")
                     return 0.0, 0.0
                 self._send(seen, with_info=True)
@@ -274,7 +282,7 @@ class RobotProcess:
             if twist is None or self._truth["collided"]:
                 reason = "arrived" if twist is None else "collision"
                 break
-            if self._exiting.is_set():
+            if self._ending():
                 reason = "the simulator is ending"
                 break
             self._advance(float(twist[0][0]), float(twist[1][0]))

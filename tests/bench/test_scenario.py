@@ -11,6 +11,7 @@ from cbe.robot import Robot
 from cbe_bench import scenario as scenario_module
 from cbe_bench.place import Place, world_seeds
 from cbe_bench.scenario import Terms, scenarios
+from cbe_hil_sim.floorplan import FloorPlan, from_floorplan
 from cbe_hil_sim.generate import TEST_SEEDS
 
 TERMS = Terms(world="test", steps=30, seed=3)
@@ -121,3 +122,14 @@ def test_world_without_room_is_an_error_that_says_so(open_place) -> None:
 def test_worlds_outside_the_split_are_refused(world, chosen) -> None:
     with pytest.raises(ConfigError):
         world_seeds(world, chosen)
+
+
+def test_small_world_is_toured_until_the_length_is_reached() -> None:
+    # Two rooms of 3 m in which no straight way is 10 m long.
+    plan = np.ones((80, 140), np.bool_)
+    plan[4:-4, 4:68] = plan[4:-4, 72:-4] = plan[30:50, 68:72] = False
+    world = from_floorplan(FloorPlan(plan, 0.05))
+    path = scenario_module._tour(world, np.random.default_rng(0), 10.0)
+    assert path is not None
+    assert np.hypot(*np.diff(path, axis=0).T).sum() >= 9.5
+    assert world.clearance_at(path).min() > Robot().body_radius_m

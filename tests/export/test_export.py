@@ -10,11 +10,9 @@ import torch
 from cbe import signature
 from cbe.errors import ModelError
 from cbe_export import export as export_module
-from cbe_export.export import write_graphs
+from cbe_export.export import identify, write_graphs
 from cbe_export.parity import Rides, worst_difference
 from cbe_runtime.networks import Networks
-from cbe_training.checkpoint import Learner
-from cbe_training.config import TrainConfig
 from cbe_training.networks import BehaviorNetworks
 
 
@@ -70,26 +68,27 @@ def test_parity_notices_a_changed_weight(
     assert worst > 1e-4
 
 
-def test_model_id_follows_the_weights(networks: BehaviorNetworks, tmp_path: Path) -> None:
-    ids = []
-    for scale in (1.0, 1.0001):
-        with torch.no_grad():
-            networks.generator.out.bias *= scale
-        target = tmp_path / str(scale)
-        target.mkdir()
-        ids.append(write_graphs(networks, target, network_period=2, segment_steps=100))
-    assert ids[0] != ids[1]
+def test_model_id_follows_the_weights(networks: BehaviorNetworks, folder: Path) -> None:
+    before = identify(networks)
+    assert Networks.load(folder).model_id == before
+    changed = BehaviorNetworks().eval()
+    changed.load_state_dict(networks.state_dict())
+    with torch.no_grad():
+        changed.generator.out.bias += 1e-4
+    assert identify(changed) != before
 
 
 def test_failed_parity_writes_nothing(
-    tmp_path: Path, rides: Rides, monkeypatch: pytest.MonkeyPatch
+    networks: BehaviorNetworks,
+    rides: Rides,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    Learner(TrainConfig(), torch.device("cpu")).save(tmp_path / "run")
+    monkeypatch.setattr(export_module, "load_networks", lambda _: networks)
     monkeypatch.setattr(Rides, "record", lambda networks, cache: rides)
+    monkeypatch.setattr(export_module, "write_graphs", lambda *_, **__: "0" * 16)
     monkeypatch.setattr(export_module, "worst_difference", lambda *_: (2e-4, 300))
     target = tmp_path / "models"
     with pytest.raises(ModelError, match="nothing was written"):
-        export_module.export(
-            tmp_path / "run", target, network_period=2, segment_steps=100, cache=tmp_path
-        )
+        export_module.export(tmp_path, target, network_period=2, segment_steps=100, cache=tmp_path)
     assert not target.exists()

@@ -28,14 +28,14 @@ class TrainConfig:
     demonstrations: int = 48  # behaviors shown in one iteration
     repeats: int = 2  # rollouts of each, from different starts
     epochs: int = 2  # times each rollout is trained on
-    minibatch: int = 16  # behaviors in one update
+    minibatch: int = 4  # behaviors in one update
     learning_rate: float = 1e-3
     warmup_updates: int = 100
     weight_decay: float = 1e-4
     clip_norm: float = 1.0
     average_decay: float = 0.998  # of the exported moving average of the weights
-    cloning_iterations: int = 70  # expert at the wheel, short behaviors
-    annealing_iterations: int = 100  # the expert's share falls from 1 to 0
+    cloning_iterations: int = 110  # expert at the wheel, short behaviors
+    annealing_iterations: int = 70  # the expert's share falls from 1 to 0
     expert_episodes: float = 0.2  # always driven by the (noisy) expert
     wrong_episodes: float = 0.06  # shown another behavior's memory
     joining_episodes: float = 0.1  # start in the middle of the behavior
