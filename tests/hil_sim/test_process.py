@@ -58,6 +58,10 @@ def start(make_room):
             with Link.open(LinkConfig(connect=(endpoint,))) as link:
                 thread.start()
                 try:
+                    # A call made before the link has heard of the process finds nobody.
+                    deadline = time.monotonic() + DEADLINE_S
+                    while not link.alive("sim"):
+                        assert time.monotonic() < deadline
                     yield link
                 finally:
                     exiting.set()

@@ -199,7 +199,8 @@ def _initialise(module: nn.Module) -> None:
     """He initialisation: with torch's default, views differ too little for attractors to learn."""
     if isinstance(module, nn.Conv2d | nn.Linear):
         nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
-        nn.init.zeros_(module.bias)
+        if module.bias is not None:
+            nn.init.zeros_(module.bias)
 
 
 def quantise(attractor: Tensor, levels: Tensor) -> Tensor:
