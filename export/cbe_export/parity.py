@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cbe import signature
-from cbe_hil_sim.generate import VALIDATION_SEEDS
 from cbe_training.config import TrainConfig
-from cbe_training.drives import Drives
+from cbe_training.drives import unseen
 from cbe_training.networks import BehaviorNetworks
 from cbe_training.rollout import roll_out, show
 
@@ -33,7 +32,7 @@ class Rides:
     def record(cls, networks: BehaviorNetworks, cache: Path) -> "Rides":
         """Let the networks repeat behaviors in validation worlds."""
         rng = np.random.default_rng(0)
-        drives = Drives.build(VALIDATION_SEEDS[:2], 4, cache)
+        drives = unseen(2, 4, cache)
         behaviors = show(drives, BEHAVIORS, FRAMES, 2, rng)
         done = roll_out(
             networks, drives, behaviors, TrainConfig(), rng, expert_share=0.0, training=False

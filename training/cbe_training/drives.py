@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cbe.robot import Robot
 from cbe_hil_sim.clearance import Clearance
 from cbe_hil_sim.demonstrator import demonstrate, sample_routes
-from cbe_hil_sim.generate import generate
+from cbe_hil_sim.generate import VALIDATION_SEEDS, generate
 from cbe_hil_sim.world import World
 from cbe_hil_sim.worldbatch import WorldBatch
 
@@ -52,6 +52,11 @@ class Drives:
             "%d drives, %.0f steps on average", len(poses), np.mean([len(p) for p in poses])
         )
         return cls(WorldBatch.pack(worlds), Clearance(worlds), world, list(poses))
+
+
+def unseen(worlds: int, per_world: int, cache: Path) -> Drives:
+    """Drives through the first validation worlds, which no run trains on."""
+    return Drives.build(VALIDATION_SEEDS[:worlds], per_world, cache)
 
 
 def cache_name(worlds: list[World], per_world: int) -> str:

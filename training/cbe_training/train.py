@@ -14,12 +14,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cbe_hil_sim.generate import TRAIN_SEEDS, VALIDATION_SEEDS
+from cbe_hil_sim.generate import TRAIN_SEEDS
 from cbe_training import losses
 from cbe_training.checkpoint import Learner
 from cbe_training.config import TrainConfig
 from cbe_training.curve import STEPS, Curve
-from cbe_training.drives import Drives
+from cbe_training.drives import Drives, unseen
 from cbe_training.networks import BehaviorNetworks
 from cbe_training.rollout import Rollouts, roll_out, show
 from cbe_training.team import Team
@@ -55,7 +55,7 @@ def train(
     first = config.seed * config.worlds
     seeds = TRAIN_SEEDS[first : first + config.worlds][team.rank :: team.size]
     drives = Drives.build(seeds, config.drives_per_world, cache)
-    unseen = Drives.build(VALIDATION_SEEDS[:VALIDATION_WORLDS], VALIDATION_DRIVES, cache)
+    validation = unseen(VALIDATION_WORLDS, VALIDATION_DRIVES, cache)
     start, saved = time.monotonic(), time.monotonic()
     before = learner.seconds
     curve = Curve(folder) if team.rank == 0 else None
@@ -66,7 +66,7 @@ def train(
         learner.iteration += 1
         learner.seconds = before + elapsed
         if learner.iteration % config.validation_every == 0:
-            row |= validate(learner.average, unseen, config, team)
+            row |= validate(learner.average, validation, config, team)
         if curve is not None:
             counts = {"iteration": learner.iteration, "sequences": learner.sequences}
             row = {**counts, "hours": learner.seconds / 3600.0, **row}
