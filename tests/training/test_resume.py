@@ -8,7 +8,7 @@ import torch
 
 from cbe.errors import ModelError
 from cbe_hil_sim.generate import generate
-from cbe_training.checkpoint import Learner, load_networks
+from cbe_training.checkpoint import Learner, load_networks, pack
 from cbe_training.config import TrainConfig
 from cbe_training.drives import Drives, cache_name
 from cbe_training.team import Team
@@ -58,6 +58,20 @@ def test_resumed_run_equals_uninterrupted_run(
         torch.testing.assert_close(second.networks.state_dict()[name], value, msg=name)
     for name, value in whole.average.state_dict().items():
         torch.testing.assert_close(second.average.state_dict()[name], value, msg=name)
+
+
+def test_packed_checkpoint_is_close_and_can_be_trained_on(tmp_path: Path) -> None:
+    learner = Learner(CONFIG, torch.device("cpu"))
+    learner.save(tmp_path / "run")
+    pack(tmp_path / "run", tmp_path / "packed")
+    packed = load_networks(tmp_path / "packed").state_dict()
+    for name, value in learner.average.state_dict().items():
+        torch.testing.assert_close(packed[name], value, atol=1e-3, rtol=1e-3, msg=name)
+    again = Learner(CONFIG, torch.device("cpu"))
+    again.load(tmp_path / "packed")
+    assert again.networks.state_dict()["trunk.stem.weight"].dtype == torch.float32
+    stored = sum(path.stat().st_size for path in (tmp_path / "packed").iterdir())
+    assert stored < 6_000_000
 
 
 def test_drives_from_the_cache_equal_those_driven(drives: Drives, tmp_path: Path) -> None:

@@ -40,6 +40,22 @@ def load_networks(folder: Path) -> BehaviorNetworks:
     return networks.eval()
 
 
+def pack(run: Path, folder: Path) -> None:
+    """Copy what a later run needs to go on and an export needs, small enough to commit.
+
+    Weights are the averaged ones in half precision; the optimiser's moments stay behind.
+    Raises ModelError if `run` holds no checkpoint.
+    """
+    load_networks(run)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in ("average.safetensors", "heads.safetensors"):
+        weights = {k: v.half() for k, v in load_file(run / name).items()}
+        _save(folder / name, weights)
+    for name in ("state.json", "log.csv", "curve.png"):
+        if (run / name).is_file():
+            (folder / name).write_bytes((run / name).read_bytes())
+
+
 class Learner:
     """What changes while training: networks, heads, optimiser, moving average, iteration."""
 
@@ -100,8 +116,11 @@ class Learner:
         temporary.replace(folder / "state.json")
 
     def load(self, folder: Path) -> None:
-        """Go on where `save` left off; without the optimiser's moments, start those afresh."""
-        self.networks.load_state_dict(load_file(folder / "networks.safetensors"))
+        """Go on where `save` left off, or from a packed checkpoint with fresh moments."""
+        networks = folder / "networks.safetensors"
+        if not networks.is_file():
+            networks = folder / "average.safetensors"
+        self.networks.load_state_dict(load_file(networks))
         self.average.load_state_dict(load_file(folder / "average.safetensors"))
         self.heads.load_state_dict(load_file(folder / "heads.safetensors"))
         state = json.loads((folder / "state.json").read_text())

@@ -12,6 +12,7 @@ import torch
 
 from cbe.errors import CbeError
 from cbe_training import team
+from cbe_training.checkpoint import pack
 from cbe_training.config import TrainConfig
 from cbe_training.train import train
 
@@ -25,6 +26,9 @@ def main() -> int:
     parser.add_argument("--hours", type=float, default=1.0, help="how much longer to train")
     parser.add_argument(
         "--decay-hours", type=float, default=0.0, help="let the learning rate fall at the end"
+    )
+    parser.add_argument(
+        "--pack", type=Path, metavar="FOLDER", help="only copy the run's weights, in half precision"
     )
     parser.add_argument("--seed", type=int, default=0, help="worlds and draws of this run")
     parser.add_argument("--worlds", type=int, default=TrainConfig().worlds)
@@ -46,7 +50,10 @@ def main() -> int:
         _work, config, arguments.run, arguments.hours, arguments.decay_hours, device, bf16
     )
     try:
-        team.run(work, workers)
+        if arguments.pack is not None:
+            pack(arguments.run, arguments.pack)
+        else:
+            team.run(work, workers)
     except CbeError as error:
         sys.stderr.write(f"cbe-train: {error}\n")
         return 1
