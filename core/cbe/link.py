@@ -27,6 +27,7 @@ logger = logging.getLogger(__name__)
 T = TypeVar("T")
 JsonObject = dict[str, Any]
 
+RETRY_S = 0.05  # between two tries to reach a process that may be starting
 _ATTACHMENT = struct.Struct("<qqB16s")
 """rmw_zenoh's: sequence number, time sent in ns, length of the writer's id, that id."""
 _ID_SIZE = 16
@@ -118,19 +119,26 @@ class Link:
     def call(
         self, name: str, request: JsonObject | None = None, timeout_s: float = 2.0
     ) -> JsonObject:
-        """The reply to `rpc/<name>`; raises LinkError for an error reply, or for none in time."""
+        """The reply to `rpc/<name>`; raises LinkError for an error reply, or for none in time.
+
+        A process that has just started is waited for: it takes a moment to be heard of.
+        """
         key = self.config.own_key(f"rpc/{name}")
-        replies = self._guarded(
-            self._session.get, key, payload=msgspec.json.encode(request or {}), timeout=timeout_s
-        )
-        for reply in replies:
-            if reply.ok is not None:
-                return _from_json(reply.ok.payload.to_bytes())
-            reason = reply.err.payload.to_bytes().decode(errors="replace")
-            if reason == "Timeout":
-                raise LinkError(f"no answer from {key} within {timeout_s:g} s")
-            raise LinkError(f"{key} answered: {reason}")
-        raise LinkError(f"nobody answers {key}; is the process that serves it running?")
+        payload = msgspec.json.encode(request or {})
+        deadline = time.monotonic() + timeout_s
+        while True:
+            left_s = max(deadline - time.monotonic(), 0.05)
+            replies = self._guarded(self._session.get, key, payload=payload, timeout=left_s)
+            for reply in replies:
+                if reply.ok is not None:
+                    return _from_json(reply.ok.payload.to_bytes())
+                reason = reply.err.payload.to_bytes().decode(errors="replace")
+                if reason == "Timeout":
+                    raise LinkError(f"no answer from {key} within {timeout_s:g} s")
+                raise LinkError(f"{key} answered: {reason}")
+            if time.monotonic() >= deadline:
+                raise LinkError(f"nobody answers {key}; is the process that serves it running?")
+            time.sleep(RETRY_S)
 
     def declare_alive(self, process: str) -> None:
         """Show others that this process lives, until the link closes or breaks."""
