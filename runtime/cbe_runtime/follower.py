@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,6 +34,8 @@ class FollowerConfig:
     fresh_s: float = 0.3  # an older image or scan stops the robot
     switch_progress: float = 0.95  # phi >= 0.95 starts the next behavior, Sec. III-D
     arrival_progress: float = 0.95  # the same on the last behavior means ARRIVED
+    resting_progress: float = 0.85  # enough for ARRIVED where the waypoint says to rest here:
+    resting_range_m: float = 0.12  # a progress that stalls below the threshold must not strand it
     progress_ticks: int = 2  # network ticks in a row that must agree, against flicker
     timeout_factor: float = 3.0  # a segment may take this many times the demonstration's steps
     timeout_steps: int = 100  # ... and this many more
@@ -181,15 +183,17 @@ class Follower:
         self._seen_stamp_ns = frame.stamp_ns
         self._prediction = prediction
         self._waypoint_m = (float(prediction.waypoint_m[0]), float(prediction.waypoint_m[1]))
-        self._judge_progress(prediction.progress)
+        self._judge_progress(prediction)
         return True
 
-    def _judge_progress(self, progress: float) -> None:
+    def _judge_progress(self, prediction: Prediction) -> None:
         """Start the next behavior, or arrive, once enough ticks in a row say so."""
-        last = self._behavior.last
-        threshold = self._config.arrival_progress if last else self._config.switch_progress
-        self._done_ticks = self._done_ticks + 1 if progress >= threshold else 0
-        if self._done_ticks < self._config.progress_ticks:
+        last, config = self._behavior.last, self._config
+        done = prediction.progress >= (config.arrival_progress if last else config.switch_progress)
+        if last and prediction.progress >= config.resting_progress:
+            done |= math.hypot(*prediction.waypoint_m) < config.resting_range_m
+        self._done_ticks = self._done_ticks + 1 if done else 0
+        if self._done_ticks < config.progress_ticks:
             return
         if last:
             self._machine.update(Events(arrived=True))
@@ -199,6 +203,8 @@ class Follower:
     def _begin(self, segment: int) -> None:
         """Enter a segment with every recurrent state reset; its first frame is the next one."""
         self._behavior = Behavior(self._networks, self._route, segment)
+        if self._prediction is not None:  # what it said of the segment left behind
+            self._prediction = replace(self._prediction, progress=0.0)
         self._done_ticks = 0
         self._age_steps = 0
 

@@ -88,7 +88,7 @@ def test_waypoint_to_the_left_turns_left(tmp_path, model_writer, route):
 def test_segment_switches_at_its_progress_and_resets_every_state(drive):
     # Ticks 19 and 20 lie above 0.95, and two in a row must agree: the 20th tick switches.
     decision = drive.step(39)
-    assert (decision.segment, decision.progress) == (1, pytest.approx(20 / 19.5))
+    assert (decision.segment, decision.progress) == (1, 0.0)
     decision = drive.step(2)
     assert decision.ticked
     assert decision.progress == pytest.approx(1 / 19.5)
@@ -107,6 +107,34 @@ def test_single_tick_of_high_progress_does_not_switch(drive, monkeypatch):
         patch.setattr(Networks, "generate", spike)
         assert drive.step().ticked
     assert drive.step(4).segment == 0
+
+
+def _saying(drive, monkeypatch, **said):
+    """Have the generator say this from now on, on the route's last segment."""
+    drive.step()
+    drive.follower._begin(1)
+    generate = Networks.generate
+
+    def fixed(self, **inputs):
+        prediction, state = generate(self, **inputs)
+        return replace(prediction, **said), state
+
+    monkeypatch.setattr(Networks, "generate", fixed)
+
+
+@pytest.mark.parametrize(
+    ("progress", "waypoint_x_m", "state"),
+    [
+        (0.9, 0.05, State.ARRIVED),
+        (0.9, 0.3, State.FOLLOWING),  # not there yet
+        (0.7, 0.05, State.FOLLOWING),  # a waypoint this near may also mean doubt
+    ],
+)
+def test_stalled_progress_arrives_only_where_the_waypoint_says_rest(
+    drive, monkeypatch, progress, waypoint_x_m, state
+):
+    _saying(drive, monkeypatch, progress=progress, waypoint_m=np.array([waypoint_x_m, 0.0]))
+    assert drive.step(6).state is state
 
 
 def test_arrives_and_comes_to_rest_at_the_last_waypoint(drive):
