@@ -70,8 +70,12 @@ class SimWorld:
             self._bullet.close()
 
     def _open_column(self) -> None:
+        import numba
+
         from cbe_hil_sim.column import ColumnBackend
 
+        # One robot gives a pool nothing to share, and waiting for its threads stalls a busy board.
+        numba.set_num_threads(1)
         self.backend = ColumnBackend([self.planning], np.zeros(1, np.int64), camera=self.camera)
 
     def _open_bullet(self, source: int | Path, gui: bool) -> None:
