@@ -93,9 +93,6 @@ def test_taught_drive_is_repeated_in_lockstep(
     assert math.dist(truth["pose"][:2], poses[-1, :2]) < SUCCESS_M
 
 
-@pytest.mark.skipif(
-    not (PACKAGED_MODELS / "encoder.onnx").exists(), reason="no trained model is shipped yet"
-)
 def test_shipped_model_arrives_at_the_end_of_a_taught_drive(
     simulator, start, endpoint, until, world, tmp_path
 ):

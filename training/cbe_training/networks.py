@@ -1,6 +1,6 @@
 """The behavior networks: one trunk shared by encoder and attractor, and a waypoint generator.
 
-Paper, Sec. III-B and III-C, at about a sixth of the authors' parameters: a patch-like stem
+Paper, Sec. III-B and III-C, at about a seventh of the authors' parameters: a patch-like stem
 replaces their 5x5 convolutions, and every frame passes through it once.
 """
 
