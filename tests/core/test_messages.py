@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.records import Schema
+from mcap_ros2.decoder import DecoderFactory
 
 from cbe.camera import CameraModel
 from cbe.errors import MessageError
@@ -158,10 +160,10 @@ def test_hashes_are_those_of_a_ros_release() -> None:
 
 @pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
 def test_schema_text_lets_another_reader_decode_the_message(message: Any) -> None:
-    from mcap_ros2._dynamic import generate_dynamic
-
     kind = MESSAGE_TYPES[message.TYPE]
-    decode = generate_dynamic(kind.name, kind.definition)[kind.name]
+    schema = Schema(id=1, data=kind.definition.encode(), encoding="ros2msg", name=kind.name)
+    decode = DecoderFactory().decoder_for("cdr", schema)
+    assert decode is not None
     decoded = decode(message.to_cdr())
     if isinstance(message, Twist):
         assert decoded.linear.x == 0.4

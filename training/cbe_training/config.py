@@ -53,7 +53,7 @@ class TrainConfig:
             return 12, 24
         if iteration < self.cloning_iterations + self.annealing_iterations:
             return 20, 40
-        return 28, 60
+        return 28, 72
 
     def expert_share(self, iteration: int) -> float:
         """Probability that a tick is driven by the expert's waypoint."""

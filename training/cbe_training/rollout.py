@@ -74,7 +74,7 @@ def show(drives: Drives, count: int, frames: int, gap: int, rng: np.random.Gener
     world = drives.world[chosen]
     every = np.repeat(np.arange(count), frames)
     supersample = 1 if rng.random() < ALIASED else 2
-    images = _photograph(
+    images = photograph(
         drives, world[every], frame_poses.reshape(-1, 3), cameras.take(every), supersample, rng
     )
     images = images.reshape(count, frames, *images.shape[1:])
@@ -134,7 +134,7 @@ def roll_out(
         if not len(rows):
             break
         poses = vehicle.poses[rows]
-        images = _photograph(
+        images = photograph(
             drives, world[rows], poses, cameras.take(rows), behaviors.supersample, rng
         )
         labels = track.label(paths.take(rows), poses, last[rows], config.lookahead_m)
@@ -191,7 +191,7 @@ def _empty(
     )
 
 
-def _photograph(
+def photograph(
     drives: Drives,
     world: NDArray[np.int64],
     poses: NDArray[np.float64],
