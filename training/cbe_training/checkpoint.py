@@ -96,7 +96,9 @@ class Learner:
         """Write all files; each replaces the old one only when whole."""
         folder.mkdir(parents=True, exist_ok=True)
         moments: dict[str, dict[str, Tensor]] = {"exp_avg": {}, "exp_avg_sq": {}}
+        steps = {}
         for index, values in self.optimizer.state_dict()["state"].items():
+            steps[str(index)] = int(values["step"])
             for name, kept in moments.items():
                 kept[str(index)] = values[name]
         _save(folder / "average.safetensors", self.average.state_dict())
@@ -110,6 +112,7 @@ class Learner:
             "updates": self.updates,
             "sequences": self.sequences,
             "seconds": round(self.seconds, 1),
+            "optimizer_steps": steps,
         }
         temporary = folder / "state.json.part"
         temporary.write_text(json.dumps(state, indent=1) + "\n")
@@ -134,7 +137,7 @@ class Learner:
         optimizer = self.optimizer.state_dict()
         optimizer["state"] = {
             int(index): {
-                "step": torch.tensor(float(self.updates)),
+                "step": torch.tensor(float(state["optimizer_steps"][index])),
                 "exp_avg": first[index],
                 "exp_avg_sq": second[index],
             }

@@ -16,6 +16,7 @@ class LossWeights:
     displacement: float = 0.5  # pose since the start, from every z
     shape: float = 0.5  # the path's points, from the final z
     relation: float = 0.3  # relative pose of two views, from their attractors
+    views: float = 0.5  # the same, of views that are not a rollout's
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,11 +35,17 @@ class TrainConfig:
     weight_decay: float = 1e-4
     clip_norm: float = 1.0
     average_decay: float = 0.998  # of the exported moving average of the weights
+    view_groups: int = 8  # groups of views in one update
+    view_groups_alone: int = 32  # the same before any behavior is learnt
+    view_updates: int = 48  # in one iteration before any behavior is learnt
+    view_iterations: int = 40  # learning how views relate, before any behavior
     cloning_iterations: int = 110  # expert at the wheel, short behaviors
     annealing_iterations: int = 70  # the expert's share falls from 1 to 0
     expert_episodes: float = 0.2  # always driven by the (noisy) expert
     wrong_episodes: float = 0.06  # shown another behavior's memory
     joining_episodes: float = 0.1  # start in the middle of the behavior
+    without_attractors: float = 0.04  # behaviors learnt from z alone, as the ablation drives them
+    without_embedding: float = 0.04  # and from attractors alone
     lookahead_m: float = 0.6
     off_route_m: float = 1.0  # a rollout further off its demonstration ends
     jitter_m: float = 0.3
@@ -49,13 +56,14 @@ class TrainConfig:
 
     def frames(self, iteration: int) -> tuple[int, int]:
         """Shortest and longest behavior of an iteration, in network frames."""
-        if iteration < self.cloning_iterations:
+        past = iteration - self.view_iterations
+        if past < self.cloning_iterations:
             return 12, 24
-        if iteration < self.cloning_iterations + self.annealing_iterations:
+        if past < self.cloning_iterations + self.annealing_iterations:
             return 20, 40
         return 28, 72
 
     def expert_share(self, iteration: int) -> float:
         """Probability that a tick is driven by the expert's waypoint."""
-        past = iteration - self.cloning_iterations
+        past = iteration - self.view_iterations - self.cloning_iterations
         return min(1.0, max(0.0, 1.0 - past / self.annealing_iterations))

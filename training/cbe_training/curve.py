@@ -2,12 +2,10 @@
 
 import csv
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    pass
-
-LOSSES = ("waypoint", "progress", "on_route", "motion", "displacement", "shape", "relation")
+LOSSES = (
+    "waypoint", "progress", "on_route", "motion", "displacement", "shape", "relation", "views",
+)  # fmt: skip
 STEPS = (64, 128)
 OUTCOMES = tuple(f"{name}_{s}" for s in STEPS for name in ("success", "collided", "false_arrival"))
 FIELDS = (
@@ -50,7 +48,7 @@ def draw(log: Path, picture: Path) -> None:
     with log.open() as file:
         rows = list(csv.DictReader(file))
     figure, (left, right) = plt.subplots(1, 2, figsize=(12, 4.5), layout="constrained")
-    for name in ("waypoint", "progress", "motion", "displacement", "shape"):
+    for name in ("waypoint", "progress", "motion", "displacement", "shape", "views"):
         points = [(float(r["hours"]), float(r[name])) for r in rows if r[name]]
         smooth, kept = [], None
         for hours, value in points:

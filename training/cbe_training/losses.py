@@ -9,10 +9,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from cbe import geometry, signature
-from cbe_training.config import LossWeights
+from cbe_training.config import LossWeights, TrainConfig
 from cbe_training.networks import BehaviorNetworks, NetworkConfig, quantise
 from cbe_training.policy import CHUNK
 from cbe_training.rollout import Behaviors, Rollouts
+from cbe_training.views import GROUP, NOW, TARGET, Views
 
 SHAPE_POINTS = 8
 LEVELS = (0, 255, 15, 15)  # attractors stored exactly, at 8 bits, at 4 bits
@@ -54,6 +55,8 @@ class Minibatch:
     progress: Tensor  # (B, S)
     on_route: Tensor  # (B, S)
     levels: Tensor  # (D, 1) attractor quantisation
+    keep_attractors: Tensor  # (D, 1) 0 where the memory lacks them
+    keep_embedding: Tensor  # (D, 1)
 
     @classmethod
     def build(
@@ -61,6 +64,7 @@ class Minibatch:
         behaviors: Behaviors,
         rollouts: Rollouts,
         chosen: NDArray[np.intp],
+        config: TrainConfig,
         rng: np.random.Generator,
         device: torch.device,
     ) -> "Minibatch":
@@ -76,6 +80,8 @@ class Minibatch:
         shape = geometry.to_frame(first[:, None], points)  # (D, 8, 2)
         goal = geometry.relative(poses, rollouts.goals[chosen][:, None])
         start = geometry.relative(poses[:, 0], rollouts.starts[chosen])
+
+        lacking = rng.random((len(shown), 1))  # one thing or the other
 
         def tensor(array: NDArray[np.generic]) -> Tensor:
             wanted = array.astype(np.float32) if array.dtype == np.float64 else array
@@ -98,6 +104,8 @@ class Minibatch:
             progress=tensor(rollouts.progress[chosen, :longest]),
             on_route=tensor(rollouts.on_route[chosen, :longest].astype(np.float32)),
             levels=tensor(rng.choice(LEVELS, (len(shown), 1)).astype(np.float32)),
+            keep_attractors=tensor((lacking >= config.without_attractors).astype(np.float32)),
+            keep_embedding=tensor((lacking <= 1.0 - config.without_embedding).astype(np.float32)),
         )
 
 
@@ -116,7 +124,9 @@ def compute(
     # The memory is stored in few bits: half precision noise on z, coarse attractors.
     goal_z = goal_z + 0.01 * torch.randn_like(goal_z)
     ends = quantise(shown_ends.flatten(1), batch.levels).view(shown, 2, -1)
-    goal_z, ends = goal_z[batch.memory], ends[batch.memory]
+    # No attractor and no z is ever all zeros: that says there is none.
+    goal_z = (goal_z * batch.keep_embedding)[batch.memory]
+    ends = (ends * batch.keep_attractors[..., None])[batch.memory]
 
     relation = networks.generator.relation
     goal_target = ends[:, 1:].expand(-1, longest, -1).flatten(0, 1)
@@ -132,7 +142,8 @@ def compute(
     # Where the robot is lost there is no right waypoint.
     driving = batch.valid & batch.right[:, None] & (batch.on_route > 0.5)
     error = torch.linalg.vector_norm(out.waypoint_m - batch.waypoint_m, dim=-1)
-    near = _near(batch.goal) & batch.valid
+    related = batch.keep_attractors[batch.memory, 0] > 0.0
+    near = _near(batch.goal) & batch.valid & related[:, None]
     pair = torch.ones_like(batch.shown_motion[..., 0], dtype=torch.bool)
     parts = {
         "waypoint": _mean(error, driving),
@@ -158,10 +169,30 @@ def compute(
             batch.shape.view(shown, SHAPE_POINTS, 2),
         ).mean(),
         "relation": _mean(_distance(heads.relation(goal_relation), batch.goal), near)
-        + _mean(_distance(heads.relation(start_relation), batch.start), _near(batch.start)),
+        + _mean(
+            _distance(heads.relation(start_relation), batch.start), _near(batch.start) & related
+        ),
     }
     total = torch.stack([getattr(weights, name) * part for name, part in parts.items()]).sum()
     return total, {name: float(part.detach()) for name, part in parts.items()}
+
+
+def relate(
+    networks: BehaviorNetworks,
+    heads: AuxiliaryHeads,
+    views: Views,
+    rng: np.random.Generator,
+    device: torch.device,
+) -> Tensor:
+    """Mean error of the relative poses read off pairs of views that overlap."""
+    attractors = networks.attractor(networks.trunk(torch.from_numpy(views.images).to(device)))
+    levels = torch.from_numpy(rng.choice(LEVELS, (len(attractors), 1)).astype(np.float32))
+    stored = quantise(attractors, levels.to(device)).view(-1, GROUP, signature.ATTRACTOR_SIZE)
+    attractors = attractors.view(stored.shape)
+    pose = torch.from_numpy(_vector(views.relation).astype(np.float32)).to(device)
+    near = _near(pose)
+    relation = networks.generator.relation(attractors[:, NOW][near], stored[:, TARGET][near])
+    return _distance(heads.relation(relation), pose[near]).mean()
 
 
 def _look(

@@ -21,14 +21,15 @@ class NetworkConfig:
     pair_channels: tuple[int, int] = (64, 128)
     motion: int = 192
     encoder_state: int = 256
-    attractor_channels: int = 96
-    relation_channels: tuple[int, int] = (96, 160)
+    attractor_channels: int = 64
+    relation_channels: tuple[int, int] = (64, 96)
     relation: int = 128
     behavior: int = 128
     generator_state: int = 320
     head: int = 128
 
 
+ATTRACTOR_SHAPE = (8, 5, 10)  # channels, rows, columns of signature.ATTRACTOR_SIZE numbers
 State = tuple[Tensor, Tensor]  # h, c of an LSTM, each (1, B, size)
 
 
@@ -108,15 +109,18 @@ class Encoder(nn.Module):
 
 
 class Attractor(nn.Module):
-    """Features of one frame to 400 numbers in [0, 1], bounded so that they quantise evenly."""
+    """Features of one frame to 400 numbers in [0, 1], bounded so that they quantise evenly.
+
+    They are 8 channels of 5 rows and 10 columns: turning the robot shifts the columns.
+    """
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         width = config.attractor_channels
         self.layers = nn.Sequential(
-            nn.Conv2d(signature.FEATURES[0], width, 3, stride=2, padding=1),
+            nn.Conv2d(signature.FEATURES[0], width, 3, stride=(2, 1), padding=1),
             nn.ReLU(),
-            nn.Conv2d(width, 16, 4),
+            nn.Conv2d(width, ATTRACTOR_SHAPE[0], (4, 7)),
         )
 
     def forward(self, features: Tensor) -> Tensor:
@@ -125,25 +129,40 @@ class Attractor(nn.Module):
 
 
 class Relation(nn.Module):
-    """Where one attractor's view lies relative to another's (paper: attractor pairs)."""
+    """Where one attractor's view lies relative to another's (paper: attractor pairs).
+
+    Every column of one view is matched with every column of the other. A turn shows as a shifted
+    diagonal of that table and a move as a bent one, which a small convolution can read.
+    """
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
+        channels, rows, columns = ATTRACTOR_SHAPE
         first, second = config.relation_channels
+        self.now = nn.Linear(channels * rows, first)
+        self.target = nn.Linear(channels * rows, first, bias=False)
+        self.match = nn.Linear(3 * rows - 2, first, bias=False)
         self.layers = nn.Sequential(
-            nn.Conv2d(48, first, 3, padding=1),
             nn.ReLU(),
-            nn.Conv2d(first, second, 3),
+            nn.Conv2d(first, second, 3, stride=2, padding=1),
             nn.ReLU(),
             nn.Flatten(),
-            nn.Linear(second * 9, config.relation),
+            nn.Linear(second * (columns // 2) ** 2, config.relation),
             nn.ReLU(),
         )
 
     def forward(self, now: Tensor, target: Tensor) -> Tensor:
         """Attractors (N, 400) twice, to (N, relation)."""
-        now, target = now.view(-1, 16, 5, 5), target.view(-1, 16, 5, 5)
-        return self.layers(torch.cat([now, target, now - target], dim=1))
+        now = 2.0 * now.view(-1, *ATTRACTOR_SHAPE) - 1.0
+        target = 2.0 * target.view(-1, *ATTRACTOR_SHAPE) - 1.0
+        one, other = now.permute(0, 2, 3, 1), target.permute(0, 2, 1, 3)
+        # Each row with the same one and, since things grow as one comes near, its neighbours.
+        rows = [one @ other, one[:, 1:] @ other[:, :-1], one[:, :-1] @ other[:, 1:]]
+        match = torch.cat(rows, dim=1) / ATTRACTOR_SHAPE[0] ** 0.5  # (N, 13, 10, 10)
+        table = self.match(match.permute(0, 2, 3, 1))  # (N, 10 now, 10 target, first)
+        table = table + self.now(now.permute(0, 3, 1, 2).flatten(2))[:, :, None]
+        table = table + self.target(target.permute(0, 3, 1, 2).flatten(2))[:, None]
+        return self.layers(table.permute(0, 3, 1, 2))
 
 
 class Generator(nn.Module):

@@ -13,15 +13,16 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from cbe_hil_sim.generate import TRAIN_SEEDS
-from cbe_training import losses
+from cbe_training import losses, views
 from cbe_training.checkpoint import Learner
 from cbe_training.config import TrainConfig
 from cbe_training.curve import STEPS, Curve
 from cbe_training.drives import Drives, unseen
 from cbe_training.networks import BehaviorNetworks
-from cbe_training.rollout import Rollouts, roll_out, show
+from cbe_training.rollout import Behaviors, Rollouts, roll_out, show
 from cbe_training.team import Team
 
 GAPS = (1, 2, 2, 2, 3)  # steps between frames: mostly the runtime's, some slower and faster
@@ -82,11 +83,20 @@ def train(
 
 
 def iterate(learner: Learner, drives: Drives, decay: float, team: Team) -> dict[str, float]:
-    """One iteration: roll out behaviors, then take a few updates on them; the mean losses."""
+    """One iteration: roll out behaviors, then take a few updates on them; the mean losses.
+
+    The first iterations of a run only learn how views relate.
+    """
     config, iteration = learner.config, learner.iteration
-    together = np.random.default_rng([config.seed, iteration])  # the same in every worker
-    rng = np.random.default_rng([config.seed, iteration, team.rank])
     torch.manual_seed((config.seed * 1_000_003 + iteration) * team.size + team.rank)
+    rng = np.random.default_rng([config.seed, iteration, team.rank])
+    learn = Updates(learner, drives, decay, team, rng)
+    if iteration < config.view_iterations:
+        began = time.monotonic()
+        for _ in range(config.view_updates):
+            learn.views()
+        return learn.means() | {"update_s": time.monotonic() - began}
+    together = np.random.default_rng([config.seed, iteration])  # the same in every worker
     shortest, longest = config.frames(iteration)
     gap = int(together.choice(GAPS))
     frames = int(together.integers(shortest, longest + 1))
@@ -96,32 +106,77 @@ def iterate(learner: Learner, drives: Drives, decay: float, team: Team) -> dict[
     driver = learner.networks if share < 1.0 else None
     rollouts = roll_out(driver, drives, behaviors, config, rng, expert_share=share)
     rolled = time.monotonic()
-    sums: dict[str, float] = {}
     for _ in range(config.epochs):
         for chosen in _minibatches(rollouts, config.minibatch // team.size, rng):
-            batch = losses.Minibatch.build(behaviors, rollouts, chosen, rng, learner.device)
-            warm = min(1.0, (learner.updates + 1) / config.warmup_updates)
-            for group in learner.optimizer.param_groups:
-                group["lr"] = config.learning_rate * warm * decay
-            with torch.autocast(learner.device.type, torch.bfloat16, enabled=learner.bf16):
-                loss, parts = losses.compute(learner.networks, learner.heads, batch, config.loss)
-            learner.optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            team.average_gradients(learner.parameters)
-            norm = torch.nn.utils.clip_grad_norm_(learner.parameters, config.clip_norm)
-            if torch.isfinite(norm):
-                learner.optimizer.step()
-            learner.updates += 1
-            learner.sequences += len(chosen) * team.size
-            learner.update_average()
-            for name, value in {**parts, "norm": float(norm)}.items():
-                sums[name] = sums.get(name, 0.0) + value
-    updates = config.epochs * (config.demonstrations // config.minibatch)
-    row = {name: value / updates for name, value in sums.items()}
+            learn.behaviors(behaviors, rollouts, chosen)
+    row = learn.means()
     row |= {"frames": behaviors.images.shape[1], "gap": gap, "expert_share": share}
     row |= {"collided": float(rollouts.collided.mean())}
     row |= {"rollout_s": rolled - began, "update_s": time.monotonic() - rolled}
     return row
+
+
+class Updates:
+    """The updates of one iteration and the means of their losses."""
+
+    def __init__(
+        self,
+        learner: Learner,
+        drives: Drives,
+        decay: float,
+        team: Team,
+        rng: np.random.Generator,
+    ) -> None:
+        self._learner, self._drives, self._decay = learner, drives, decay
+        self._team, self._rng = team, rng
+        self._sums: dict[str, float] = {}
+        self._count = 0
+
+    def behaviors(self, behaviors: Behaviors, rollouts: Rollouts, chosen: NDArray[np.intp]) -> None:
+        """Learn from repetitions `chosen` and, beside them, from views."""
+        learner, config = self._learner, self._learner.config
+        batch = losses.Minibatch.build(
+            behaviors, rollouts, chosen, config, self._rng, learner.device
+        )
+        with self._arithmetic():
+            loss, parts = losses.compute(learner.networks, learner.heads, batch, config.loss)
+        learner.sequences += len(chosen) * self._team.size
+        self._step(loss, parts, config.view_groups)
+
+    def views(self) -> None:
+        """Learn from views alone."""
+        self._step(
+            torch.zeros((), device=self._learner.device), {}, self._learner.config.view_groups_alone
+        )
+
+    def means(self) -> dict[str, float]:
+        """Mean of each loss and of the gradient's norm."""
+        return {name: value / self._count for name, value in self._sums.items()}
+
+    def _step(self, loss: Tensor, parts: dict[str, float], groups: int) -> None:
+        learner, config, rng = self._learner, self._learner.config, self._rng
+        seen = views.draw(self._drives, groups // self._team.size, rng)
+        with self._arithmetic():
+            error = losses.relate(learner.networks, learner.heads, seen, rng, learner.device)
+        loss = loss + config.loss.views * error
+        warm = min(1.0, (learner.updates + 1) / config.warmup_updates)
+        for group in learner.optimizer.param_groups:
+            group["lr"] = config.learning_rate * warm * self._decay
+        learner.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        self._team.average_gradients(learner.parameters)
+        norm = torch.nn.utils.clip_grad_norm_(learner.parameters, config.clip_norm)
+        if torch.isfinite(norm):
+            learner.optimizer.step()
+        learner.updates += 1
+        learner.update_average()
+        for name, value in {**parts, "views": float(error.detach()), "norm": float(norm)}.items():
+            self._sums[name] = self._sums.get(name, 0.0) + value
+        self._count += 1
+
+    def _arithmetic(self) -> torch.autocast:
+        learner = self._learner
+        return torch.autocast(learner.device.type, torch.bfloat16, enabled=learner.bf16)
 
 
 def validate(

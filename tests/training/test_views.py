@@ -1,0 +1,52 @@
+"""Views of one place: their poses fit together, and a network can learn to relate them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from cbe import geometry
+from cbe_training import losses, views
+from cbe_training.drives import Drives
+from cbe_training.losses import AuxiliaryHeads
+from cbe_training.networks import BehaviorNetworks
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Drives:
+    return Drives.build(range(2), 6, tmp_path_factory.mktemp("drives"))
+
+
+def test_relations_of_a_pair_undo_each_other(drives: Drives) -> None:
+    drawn = views.draw(drives, 3, np.random.default_rng(0))
+    pairs = list(zip(views.NOW, views.TARGET, strict=True))
+    back = [pairs.index((target, now)) for now, target in pairs]
+    there_and_back = geometry.compose(drawn.relation, drawn.relation[:, back])
+    np.testing.assert_allclose(there_and_back, 0.0, atol=1e-9)
+    assert np.ptp(drawn.relation[..., 0]) > 0.5
+
+
+def test_same_draw_gives_same_views(drives: Drives) -> None:
+    one, other = (views.draw(drives, 2, np.random.default_rng(5)) for _ in range(2))
+    np.testing.assert_array_equal(one.images, other.images)
+    np.testing.assert_array_equal(one.relation, other.relation)
+
+
+def test_networks_learn_to_relate_a_few_views(drives: Drives, tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    networks = BehaviorNetworks()
+    heads = AuxiliaryHeads(networks.config)
+    drawn = views.draw(drives, 4, np.random.default_rng(1))
+    optimizer = torch.optim.AdamW([*networks.parameters(), *heads.parameters()], lr=1e-3)
+    errors = []
+    for _ in range(120):
+        error = losses.relate(networks, heads, drawn, np.random.default_rng(2), CPU)
+        optimizer.zero_grad()
+        error.backward()
+        optimizer.step()
+        errors.append(float(error.detach()))
+    assert errors[-1] < 0.4 * errors[0]
+    assert errors[-1] < 0.4
