@@ -17,7 +17,7 @@ def networks() -> BehaviorNetworks:
 
 def test_embedding_of_a_sequence_equals_that_of_single_ticks(networks: BehaviorNetworks) -> None:
     images = np.random.default_rng(0).integers(0, 255, (2, 5, 64, 64, 3), dtype=np.uint8)
-    memory = memorise(networks, images)
+    memory, _ = memorise(networks, images)
     policy = Policy(networks, memory)
     rows = np.arange(2)
     for tick in range(5):
@@ -31,7 +31,7 @@ def test_robots_in_one_batch_do_not_touch_each_other(networks: BehaviorNetworks)
     rng = np.random.default_rng(1)
     shown = rng.integers(0, 255, (2, 3, 64, 64, 3), dtype=np.uint8)
     seen = rng.integers(0, 255, (4, 2, 64, 64, 3), dtype=np.uint8)
-    memory = memorise(networks, shown)
+    memory, _ = memorise(networks, shown)
     both = Policy(networks, memory)
     alone = Policy(networks, memory.take(np.array([1])))
     for tick in range(4):

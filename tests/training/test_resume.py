@@ -9,7 +9,7 @@ import torch
 from cbe.errors import ModelError
 from cbe_hil_sim.generate import generate
 from cbe_training.checkpoint import Learner, load_networks, pack
-from cbe_training.config import TrainConfig
+from cbe_training.config import Learn, TrainConfig
 from cbe_training.drives import Drives, cache_name
 from cbe_training.team import Team
 from cbe_training.train import iterate
@@ -20,9 +20,11 @@ CONFIG = replace(
     worlds=2,
     demonstrations=4,
     minibatch=2,
+    view_groups_alone=2,
+    view_updates=2,
     epochs=1,
-    cloning_iterations=1,
-    annealing_iterations=1,
+    cloning_sequences=1,
+    annealing_sequences=1,
 )
 
 
@@ -31,26 +33,29 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Drives:
     return Drives.build(range(2), 8, tmp_path_factory.mktemp("drives"))
 
 
-def _iterate(learner: Learner, drives: Drives, count: int) -> None:
+def _iterate(learner: Learner, drives: Drives, count: int, what: Learn = Learn.ALL) -> None:
     for _ in range(count):
-        iterate(learner, drives, 1.0, Team())
+        iterate(learner, drives, 1.0, Team(), what)
         learner.iteration += 1
 
 
+@pytest.mark.parametrize("what", Learn)
 def test_resumed_run_equals_uninterrupted_run(
-    drives: Drives, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    drives: Drives, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: Learn
 ) -> None:
-    monkeypatch.setattr(TrainConfig, "frames", lambda self, iteration: (6, 9))
+    monkeypatch.setattr(TrainConfig, "frames", lambda self, sequences: (6, 9))
     device = torch.device("cpu")
     whole = Learner(CONFIG, device)
-    _iterate(whole, drives, 3)
+    _iterate(whole, drives, 1, Learn.VIEWS)  # some parameters start to learn later than others
+    _iterate(whole, drives, 2, what)
 
     first = Learner(CONFIG, device)
-    _iterate(first, drives, 2)
+    _iterate(first, drives, 1, Learn.VIEWS)
+    _iterate(first, drives, 1, what)
     first.save(tmp_path)
     second = Learner(CONFIG, device)
     second.load(tmp_path)
-    _iterate(second, drives, 1)
+    _iterate(second, drives, 1, what)
 
     assert second.iteration == 3
     assert second.updates == whole.updates
@@ -58,6 +63,20 @@ def test_resumed_run_equals_uninterrupted_run(
         torch.testing.assert_close(second.networks.state_dict()[name], value, msg=name)
     for name, value in whole.average.state_dict().items():
         torch.testing.assert_close(second.average.state_dict()[name], value, msg=name)
+
+
+def test_convolutions_rest_while_behaviors_are_learnt(
+    drives: Drives, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(TrainConfig, "frames", lambda self, sequences: (6, 9))
+    learner = Learner(CONFIG, torch.device("cpu"))
+    before = {k: v.clone() for k, v in learner.networks.state_dict().items()}
+    _iterate(learner, drives, 1, Learn.BEHAVIORS)
+    still = {k for k, v in learner.networks.state_dict().items() if v.equal(before[k])}
+    convolutions = {k for k in before if k.startswith(("trunk.", "encoder.pair.", "attractor."))}
+    assert still == convolutions
+    _iterate(learner, drives, 1)
+    assert not any(learner.networks.state_dict()[k].equal(before[k]) for k in convolutions)
 
 
 def test_packed_checkpoint_is_close_and_can_be_trained_on(tmp_path: Path) -> None:

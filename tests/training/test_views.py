@@ -1,18 +1,15 @@
 """Views of one place: their poses fit together, and a network can learn to relate them."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 
 from cbe import geometry
 from cbe_training import losses, views
+from cbe_training.config import LossWeights
 from cbe_training.drives import Drives
 from cbe_training.losses import AuxiliaryHeads
 from cbe_training.networks import BehaviorNetworks
-
-CPU = torch.device("cpu")
 
 
 @pytest.fixture(scope="module")
@@ -29,24 +26,34 @@ def test_relations_of_a_pair_undo_each_other(drives: Drives) -> None:
     assert np.ptp(drawn.relation[..., 0]) > 0.5
 
 
+def test_views_that_move_show_where_from(drives: Drives) -> None:
+    drawn = views.draw(drives, 40, np.random.default_rng(3))
+    length = np.hypot(drawn.motion[:, 0], drawn.motion[:, 1])
+    assert drawn.before.shape == (80, 64, 64, 3)
+    assert 0.1 < length.max() <= views.LONGEST_STEP_M + 1e-9
+    assert (drawn.motion[:, 0] > 0.0).all()
+    assert (abs(drawn.motion[:, 2]) <= views.CURVATURE_PER_M * length + 1e-9).all()
+
+
 def test_same_draw_gives_same_views(drives: Drives) -> None:
     one, other = (views.draw(drives, 2, np.random.default_rng(5)) for _ in range(2))
     np.testing.assert_array_equal(one.images, other.images)
     np.testing.assert_array_equal(one.relation, other.relation)
 
 
-def test_networks_learn_to_relate_a_few_views(drives: Drives, tmp_path: Path) -> None:
+def test_networks_learn_to_relate_a_few_views(drives: Drives) -> None:
     torch.manual_seed(0)
     networks = BehaviorNetworks()
     heads = AuxiliaryHeads(networks.config)
     drawn = views.draw(drives, 4, np.random.default_rng(1))
+    weights = LossWeights()
     optimizer = torch.optim.AdamW([*networks.parameters(), *heads.parameters()], lr=1e-3)
     errors = []
     for _ in range(120):
-        error = losses.relate(networks, heads, drawn, np.random.default_rng(2), CPU)
+        error, parts = losses.relate(networks, heads, drawn, weights, np.random.default_rng(2))
         optimizer.zero_grad()
         error.backward()
         optimizer.step()
-        errors.append(float(error.detach()))
+        errors.append(parts["views"])
     assert errors[-1] < 0.4 * errors[0]
     assert errors[-1] < 0.4

@@ -13,7 +13,7 @@ import torch
 from cbe.errors import CbeError
 from cbe_training import team
 from cbe_training.checkpoint import pack
-from cbe_training.config import TrainConfig
+from cbe_training.config import Learn, TrainConfig
 from cbe_training.train import train
 
 
@@ -24,6 +24,12 @@ def main() -> int:
     )
     parser.add_argument("--run", type=Path, default=Path("runs/default"), help="folder of the run")
     parser.add_argument("--hours", type=float, default=1.0, help="how much longer to train")
+    parser.add_argument(
+        "--learn",
+        choices=[what.value for what in Learn],
+        default=Learn.ALL.value,
+        help="views: convolutions only; behaviors: all else, 3 times faster than all",
+    )
     parser.add_argument(
         "--decay-hours", type=float, default=0.0, help="let the learning rate fall at the end"
     )
@@ -47,7 +53,14 @@ def main() -> int:
     config = replace(TrainConfig(), seed=arguments.seed, worlds=arguments.worlds)
     bf16 = device.type == "cuda" if arguments.bf16 is None else arguments.bf16
     work = partial(
-        _work, config, arguments.run, arguments.hours, arguments.decay_hours, device, bf16
+        _work,
+        config,
+        arguments.run,
+        arguments.hours,
+        device,
+        what=Learn(arguments.learn),
+        decay_hours=arguments.decay_hours,
+        bf16=bf16,
     )
     try:
         if arguments.pack is not None:
@@ -64,11 +77,13 @@ def _work(
     config: TrainConfig,
     folder: Path,
     hours: float,
-    decay_hours: float,
     device: torch.device,
-    bf16: bool,
     member: team.Team,
+    *,
+    what: Learn,
+    decay_hours: float,
+    bf16: bool,
 ) -> None:
     level = logging.INFO if member.rank == 0 else logging.WARNING
     logging.basicConfig(level=level, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
-    train(config, folder, hours, device, member, decay_hours=decay_hours, bf16=bf16)
+    train(config, folder, hours, device, member, what=what, decay_hours=decay_hours, bf16=bf16)

@@ -1,8 +1,17 @@
 """One frozen configuration of a training run, stored beside every checkpoint."""
 
 from dataclasses import dataclass, field
+from enum import Enum
 
 from cbe_training.networks import NetworkConfig
+
+
+class Learn(Enum):
+    """What a piece of a run learns."""
+
+    VIEWS = "views"  # the convolutions alone, from still views: start with this
+    BEHAVIORS = "behaviors"  # the rest, the convolutions' outputs being kept from the rollout
+    ALL = "all"
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,11 +45,10 @@ class TrainConfig:
     clip_norm: float = 1.0
     average_decay: float = 0.998  # of the exported moving average of the weights
     view_groups: int = 8  # groups of views in one update
-    view_groups_alone: int = 32  # the same before any behavior is learnt
-    view_updates: int = 48  # in one iteration before any behavior is learnt
-    view_iterations: int = 40  # learning how views relate, before any behavior
-    cloning_iterations: int = 110  # expert at the wheel, short behaviors
-    annealing_iterations: int = 70  # the expert's share falls from 1 to 0
+    view_groups_alone: int = 32  # the same where only views are learnt from
+    view_updates: int = 48  # in one such iteration
+    cloning_sequences: int = 21_000  # expert at the wheel, short behaviors
+    annealing_sequences: int = 13_000  # the expert's share falls from 1 to 0
     expert_episodes: float = 0.2  # always driven by the (noisy) expert
     wrong_episodes: float = 0.06  # shown another behavior's memory
     joining_episodes: float = 0.1  # start in the middle of the behavior
@@ -54,16 +62,15 @@ class TrainConfig:
     network: NetworkConfig = field(default_factory=NetworkConfig)
     loss: LossWeights = field(default_factory=LossWeights)
 
-    def frames(self, iteration: int) -> tuple[int, int]:
-        """Shortest and longest behavior of an iteration, in network frames."""
-        past = iteration - self.view_iterations
-        if past < self.cloning_iterations:
+    def frames(self, sequences: int) -> tuple[int, int]:
+        """Shortest and longest behavior, in network frames, after `sequences` trained on."""
+        if sequences < self.cloning_sequences:
             return 12, 24
-        if past < self.cloning_iterations + self.annealing_iterations:
+        if sequences < self.cloning_sequences + self.annealing_sequences:
             return 20, 40
         return 28, 72
 
-    def expert_share(self, iteration: int) -> float:
+    def expert_share(self, sequences: int) -> float:
         """Probability that a tick is driven by the expert's waypoint."""
-        past = iteration - self.view_iterations - self.cloning_iterations
-        return min(1.0, max(0.0, 1.0 - past / self.annealing_iterations))
+        past = sequences - self.cloning_sequences
+        return min(1.0, max(0.0, 1.0 - past / self.annealing_sequences))

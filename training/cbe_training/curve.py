@@ -5,6 +5,7 @@ from pathlib import Path
 
 LOSSES = (
     "waypoint", "progress", "on_route", "motion", "displacement", "shape", "relation", "views",
+    "view_motion",
 )  # fmt: skip
 STEPS = (64, 128)
 OUTCOMES = tuple(f"{name}_{s}" for s in STEPS for name in ("success", "collided", "false_arrival"))

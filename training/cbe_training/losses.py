@@ -11,9 +11,9 @@ from torch.nn import functional as F
 from cbe import geometry, signature
 from cbe_training.config import LossWeights, TrainConfig
 from cbe_training.networks import BehaviorNetworks, NetworkConfig, quantise
-from cbe_training.policy import CHUNK
+from cbe_training.policy import Seen, look
 from cbe_training.rollout import Behaviors, Rollouts
-from cbe_training.views import GROUP, NOW, TARGET, Views
+from cbe_training.views import GROUP, MOVING, NOW, TARGET, Views
 
 SHAPE_POINTS = 8
 LEVELS = (0, 255, 15, 15)  # attractors stored exactly, at 8 bits, at 4 bits
@@ -39,11 +39,11 @@ def _perceptron(inputs: int, outputs: int) -> nn.Sequential:
 class Minibatch:
     """D behaviors and their B repetitions as tensors; labels in metres and radians."""
 
-    shown_images: Tensor  # (D, T, 64, 64, 3) uint8
+    shown: Tensor | Seen  # (D, T, 64, 64, 3) uint8, or what was seen in them
     shown_motion: Tensor  # (D, T, 3) pose of each frame in the one before
     shown_displacement: Tensor  # (D, T, 4) x, y, cos, sin since the first frame
     shape: Tensor  # (D, 16) points along the path, in the first frame's frame
-    images: Tensor  # (B, S, 64, 64, 3) uint8
+    driven: Tensor | Seen  # (B, S, 64, 64, 3) uint8, or what was seen in them
     motion: Tensor  # (B, S, 3)
     displacement: Tensor  # (B, S, 4)
     goal: Tensor  # (B, S, 4) the goal's pose from each frame
@@ -67,8 +67,13 @@ class Minibatch:
         config: TrainConfig,
         rng: np.random.Generator,
         device: torch.device,
+        *,
+        look_again: bool,
     ) -> "Minibatch":
-        """Repetitions `chosen` (B,) and the behaviors they were shown."""
+        """Repetitions `chosen` (B,) and the behaviors they were shown.
+
+        Unless `look_again`, the convolutions are left as they were when driving.
+        """
         shown, memory = np.unique(rollouts.shown[chosen], return_inverse=True)
         longest = int(rollouts.frames[chosen].max())
         poses = rollouts.poses[chosen, :longest]
@@ -87,12 +92,21 @@ class Minibatch:
             wanted = array.astype(np.float32) if array.dtype == np.float64 else array
             return torch.from_numpy(np.ascontiguousarray(wanted)).to(device)
 
+        if look_again:
+            shown_seen: Tensor | Seen = tensor(behaviors.images[shown])
+            seen: Tensor | Seen = tensor(rollouts.images[chosen, :longest])
+        else:
+            assert rollouts.seen is not None
+            assert rollouts.shown_seen is not None
+            shown_seen = rollouts.shown_seen.take(shown)
+            seen = Seen(*(kept[:, :longest] for kept in rollouts.seen.take(chosen)))
+
         return cls(
-            shown_images=tensor(behaviors.images[shown]),
+            shown=shown_seen,
             shown_motion=tensor(_motion(frame_poses)),
             shown_displacement=tensor(_vector(geometry.relative(frame_poses[:, :1], frame_poses))),
             shape=tensor(shape.reshape(len(shown), -1)),
-            images=tensor(rollouts.images[chosen, :longest]),
+            driven=seen,
             motion=tensor(_motion(poses)),
             displacement=tensor(_vector(geometry.relative(poses[:, :1], poses))),
             goal=tensor(_vector(goal)),
@@ -113,10 +127,10 @@ def compute(
     networks: BehaviorNetworks, heads: AuxiliaryHeads, batch: Minibatch, weights: LossWeights
 ) -> tuple[Tensor, dict[str, float]]:
     """Weighted loss and its parts."""
-    shown = len(batch.shown_images)
-    count, longest = batch.images.shape[:2]
-    shown_motion, shown_ends, _ = _look(networks, batch.shown_images, whole=False)
-    motion, _, attractors = _look(networks, batch.images, whole=True)
+    shown = len(batch.shown_motion)
+    count, longest = batch.valid.shape
+    shown_motion, shown_ends = _seen(networks, batch.shown, every=False)
+    motion, attractors = _seen(networks, batch.driven, every=True)
     shown_z, _ = networks.encoder(shown_motion)  # (D, T, 32)
     z, _ = networks.encoder(motion)  # (B, S, 32)
 
@@ -181,39 +195,31 @@ def relate(
     networks: BehaviorNetworks,
     heads: AuxiliaryHeads,
     views: Views,
+    weights: LossWeights,
     rng: np.random.Generator,
-    device: torch.device,
-) -> Tensor:
-    """Mean error of the relative poses read off pairs of views that overlap."""
-    attractors = networks.attractor(networks.trunk(torch.from_numpy(views.images).to(device)))
+) -> tuple[Tensor, dict[str, float]]:
+    """Weighted loss and its parts: poses read off pairs of views, and off pairs of frames."""
+    device = next(networks.parameters()).device
+    features = networks.trunk(torch.from_numpy(views.images).to(device))
+    attractors = networks.attractor(features)
     levels = torch.from_numpy(rng.choice(LEVELS, (len(attractors), 1)).astype(np.float32))
     stored = quantise(attractors, levels.to(device)).view(-1, GROUP, signature.ATTRACTOR_SIZE)
     attractors = attractors.view(stored.shape)
     pose = torch.from_numpy(_vector(views.relation).astype(np.float32)).to(device)
     near = _near(pose)
     relation = networks.generator.relation(attractors[:, NOW][near], stored[:, TARGET][near])
-    return _distance(heads.relation(relation), pose[near]).mean()
+    related = _distance(heads.relation(relation), pose[near]).mean()
+
+    before = networks.trunk(torch.from_numpy(views.before).to(device))
+    now = features.view(-1, GROUP, *features.shape[1:])[:, :MOVING].flatten(0, 1)
+    motion = torch.from_numpy(views.motion.astype(np.float32)).to(device)
+    moved = _distance(heads.motion(networks.encoder.pair(now, before)), motion * 5.0).mean()
+    total = weights.views * (related + moved)
+    return total, {"views": float(related.detach()), "view_motion": float(moved.detach())}
 
 
-def _look(
-    networks: BehaviorNetworks, images: Tensor, *, whole: bool
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Motion (B, T, motion), attractors of the ends (B, 2, 400) and, if `whole`, of all frames."""
-    count, steps = images.shape[:2]
-    motions, ends, attractors = [], [], []
-    for some in images.split(max(1, CHUNK // steps)):
-        features = networks.trunk(some.flatten(0, 1))  # (b * T, 48, 16, 16)
-        motions.append(networks.encoder.pair.sequence(features, len(some)))
-        if whole:
-            attractors.append(networks.attractor(features))
-        else:
-            features = features.view(len(some), steps, *features.shape[1:])[:, [0, -1]]
-            ends.append(networks.attractor(features.flatten(0, 1)))
-    motion = torch.cat(motions).view(count, steps, -1)
-    if whole:
-        every = torch.cat(attractors).view(count, steps, -1)
-        return motion, every[:, [0, -1]], every
-    return motion, torch.cat(ends).view(count, 2, -1), motion
+def _seen(networks: BehaviorNetworks, frames: Tensor | Seen, *, every: bool) -> Seen:
+    return frames if isinstance(frames, Seen) else look(networks, frames, every=every)
 
 
 def _motion(poses: NDArray[np.float64]) -> NDArray[np.float64]:

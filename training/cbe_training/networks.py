@@ -213,6 +213,11 @@ class BehaviorNetworks(nn.Module):
         self.generator = Generator(self.config)
         self.apply(_initialise)
 
+    def freeze_convolutions(self, frozen: bool) -> None:
+        """Choose whether everything between images and what is kept of them learns."""
+        for part in (self.trunk, self.encoder.pair, self.attractor):
+            part.requires_grad_(not frozen)
+
 
 def _initialise(module: nn.Module) -> None:
     """He initialisation: with torch's default, views differ too little for attractors to learn."""

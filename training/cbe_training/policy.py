@@ -1,24 +1,58 @@
 """The networks at the wheel of many robots, one tick at a time, as the runtime runs them."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cbe import signature
 from cbe_training.networks import BehaviorNetworks
 
 CHUNK = 384  # frames convolved at once; more does not fit a small CPU's cache
 
 
-@dataclass(frozen=True, slots=True)
-class Memory:
+class Seen(NamedTuple):
+    """What the convolutions make of B sequences of T frames."""
+
+    motion: Tensor  # (B, T, motion)
+    attractors: Tensor  # (B, T, 400) of every frame, or (B, 2, 400) of the first and the last
+
+    def take(self, index: NDArray[np.intp]) -> "Seen":
+        """Rows `index`."""
+        rows = torch.as_tensor(index, device=self.motion.device)
+        return Seen(self.motion[rows], self.attractors[rows])
+
+
+def look(networks: BehaviorNetworks, images: Tensor, *, every: bool) -> Seen:
+    """Images (B, T, 64, 64, 3) to features, with attractors of every frame or of the ends."""
+    count, steps = images.shape[:2]
+    motions, attractors = [], []
+    for some in images.split(max(1, CHUNK // steps)):
+        features = networks.trunk(some.flatten(0, 1))  # (b * T, 32, 16, 16)
+        motions.append(networks.encoder.pair.sequence(features, len(some)))
+        if not every:
+            features = features.view(len(some), steps, *features.shape[1:])[:, [0, -1]].flatten(
+                0, 1
+            )
+        attractors.append(networks.attractor(features))
+    motion = torch.cat(motions).view(count, steps, -1)
+    return Seen(motion, torch.cat(attractors).view(count, -1, signature.ATTRACTOR_SIZE))
+
+
+class Memory(NamedTuple):
     """What is kept of D demonstrations: z (D, 32), attractors (D, 400) of first and last frame."""
 
     embedding: Tensor
     start: Tensor
     goal: Tensor
+
+    @classmethod
+    def of(cls, networks: BehaviorNetworks, seen: Seen) -> "Memory":
+        """Encode what was seen of demonstrations."""
+        embedding, _ = networks.encoder(seen.motion)
+        return cls(embedding[:, -1], seen.attractors[:, 0], seen.attractors[:, -1])
 
     def take(self, index: NDArray[np.intp]) -> "Memory":
         """Rows `index`."""
@@ -27,25 +61,18 @@ class Memory:
 
 
 @torch.no_grad()
-def memorise(networks: BehaviorNetworks, images: NDArray[np.uint8]) -> Memory:
-    """Encode demonstrations (D, T, 64, 64, 3)."""
+def memorise(networks: BehaviorNetworks, images: NDArray[np.uint8]) -> tuple[Memory, Seen]:
+    """Look at demonstrations (D, T, 64, 64, 3) and encode them."""
     device = next(networks.parameters()).device
-    embeddings, starts, goals = [], [], []
-    each = max(1, CHUNK // images.shape[1])
-    for first in range(0, len(images), each):
-        some = torch.from_numpy(images[first : first + each]).to(device)
-        features = networks.trunk(some.flatten(0, 1))  # (d * T, 48, 16, 16)
-        motion = networks.encoder.pair.sequence(features, len(some)).view(*some.shape[:2], -1)
-        embedding, _ = networks.encoder(motion)
-        ends = features.view(*some.shape[:2], *features.shape[1:])
-        embeddings.append(embedding[:, -1])
-        starts.append(networks.attractor(ends[:, 0]))
-        goals.append(networks.attractor(ends[:, -1]))
-    return Memory(torch.cat(embeddings), torch.cat(starts), torch.cat(goals))
+    seen = look(networks, torch.from_numpy(images).to(device), every=False)
+    return Memory.of(networks, seen), seen
 
 
 class Policy:
-    """B robots, robot b repeating row b of the memory."""
+    """B robots, robot b repeating row b of the memory.
+
+    `seen` holds what the last tick's rows looked like to the convolutions, one frame each.
+    """
 
     def __init__(self, networks: BehaviorNetworks, memory: Memory) -> None:
         """Start every recurrent state afresh."""
@@ -57,6 +84,7 @@ class Policy:
         self._generator = torch.zeros(2, count, config.generator_state, device=self._device)
         self._previous: Tensor | None = None
         self._start = torch.zeros(count, config.relation, device=self._device)
+        self.seen: Seen
 
     @torch.no_grad()
     def tick(
@@ -76,6 +104,7 @@ class Policy:
             self._start = nets.generator.relation(attractor, self._memory.start)
         motion = nets.encoder.pair(features, features if first else self._previous[index])
         self._previous[index] = features
+        self.seen = Seen(motion[:, None], attractor[:, None])
         state = self._encoder[:, index]
         embedding, (h, c) = nets.encoder(motion[:, None], (state[:1], state[1:]))
         self._encoder[:, index] = torch.cat([h, c])

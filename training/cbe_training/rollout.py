@@ -1,6 +1,6 @@
 """Lock-step rollouts: behaviors are shown, then repeated from jittered starts (Sec. IV-A)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from cbe_training.appearance import Appearance
 from cbe_training.config import TrainConfig
 from cbe_training.drives import Drives
 from cbe_training.networks import BehaviorNetworks
-from cbe_training.policy import Policy, memorise
+from cbe_training.policy import Policy, Seen, memorise
 
 FRAMES_PAST_GOAL = 3
 FRAMES_OFF_ROUTE = 4
@@ -57,6 +57,8 @@ class Rollouts:
     arrived: NDArray[np.bool_]  # (B,) declared so itself
     collided: NDArray[np.bool_]
     success: NDArray[np.bool_]  # arrived within 0.5 m and 30 deg, without collision
+    seen: Seen | None = None  # B sequences, as the driving networks saw them
+    shown_seen: Seen | None = None  # D sequences
 
 
 def show(drives: Drives, count: int, frames: int, gap: int, rng: np.random.Generator) -> Behaviors:
@@ -120,12 +122,16 @@ def roll_out(
     )
     vehicle.speed_mps = np.where(rng.random(count) < 0.5, rng.uniform(0.0, 0.5, count), 0.0)
     cameras = appearance.vary(rng, behaviors.cameras.take(driven))
-    policy = None
+    policy = shown_seen = None
     if networks is not None:
-        policy = Policy(networks, memorise(networks, behaviors.images).take(shown))
+        memory, shown_seen = memorise(networks, behaviors.images)
+        policy = Policy(networks, memory.take(shown))
 
     longest = int(behaviors.images.shape[1] * (1.3 if training else 2.0)) + 8
     out = _empty(count, longest, behaviors, shown, driven)
+    if shown_seen is not None:
+        seen = Seen(*(new.new_zeros(count, longest, new.shape[-1]) for new in shown_seen))
+        out = replace(out, seen=seen, shown_seen=shown_seen)
     active = np.ones(count, np.bool_)
     past_goal, off_route, nearly = np.zeros((3, count), np.int64)
     angle = np.zeros(count)
@@ -148,6 +154,8 @@ def roll_out(
         waypoint = _turn(labels.waypoint_m, angle[rows])
         if policy is not None:
             own, progress, _ = policy.tick(rows, images)
+            for kept, new in zip(out.seen or (), policy.seen, strict=True):
+                kept[rows, tick] = new[:, 0]
             mine = (rng.random(len(rows)) >= expert_share) & ~expert_only[rows]
             waypoint = np.where(mine[:, None], own, waypoint)
             nearly[rows] = np.where(progress >= 0.95, nearly[rows] + 1, 0)

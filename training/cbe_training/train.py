@@ -18,7 +18,7 @@ from torch import Tensor
 from cbe_hil_sim.generate import TRAIN_SEEDS
 from cbe_training import losses, views
 from cbe_training.checkpoint import Learner
-from cbe_training.config import TrainConfig
+from cbe_training.config import Learn, TrainConfig
 from cbe_training.curve import STEPS, Curve
 from cbe_training.drives import Drives, unseen
 from cbe_training.networks import BehaviorNetworks
@@ -40,6 +40,7 @@ def train(
     device: torch.device,
     team: Team,
     *,
+    what: Learn = Learn.ALL,
     decay_hours: float = 0.0,
     bf16: bool = False,
 ) -> None:
@@ -63,10 +64,10 @@ def train(
     while (elapsed := team.latest(time.monotonic() - start)) < hours * 3600.0:
         left = hours * 3600.0 - elapsed
         decay = min(1.0, left / (decay_hours * 3600.0)) if decay_hours > 0.0 else 1.0
-        row = iterate(learner, drives, decay, team)
+        row = iterate(learner, drives, decay, team, what)
         learner.iteration += 1
         learner.seconds = before + elapsed
-        if learner.iteration % config.validation_every == 0:
+        if what is not Learn.VIEWS and learner.iteration % config.validation_every == 0:
             row |= validate(learner.average, validation, config, team)
         if curve is not None:
             counts = {"iteration": learner.iteration, "sequences": learner.sequences}
@@ -82,33 +83,33 @@ def train(
         curve.draw()
 
 
-def iterate(learner: Learner, drives: Drives, decay: float, team: Team) -> dict[str, float]:
-    """One iteration: roll out behaviors, then take a few updates on them; the mean losses.
-
-    The first iterations of a run only learn how views relate.
-    """
+def iterate(
+    learner: Learner, drives: Drives, decay: float, team: Team, what: Learn = Learn.ALL
+) -> dict[str, float]:
+    """One iteration: roll out behaviors, then take a few updates on them; the mean losses."""
     config, iteration = learner.config, learner.iteration
+    learner.networks.freeze_convolutions(what is Learn.BEHAVIORS)
     torch.manual_seed((config.seed * 1_000_003 + iteration) * team.size + team.rank)
     rng = np.random.default_rng([config.seed, iteration, team.rank])
     learn = Updates(learner, drives, decay, team, rng)
-    if iteration < config.view_iterations:
+    if what is Learn.VIEWS:
         began = time.monotonic()
         for _ in range(config.view_updates):
             learn.views()
         return learn.means() | {"update_s": time.monotonic() - began}
     together = np.random.default_rng([config.seed, iteration])  # the same in every worker
-    shortest, longest = config.frames(iteration)
+    shortest, longest = config.frames(learner.sequences)
     gap = int(together.choice(GAPS))
     frames = int(together.integers(shortest, longest + 1))
-    share = config.expert_share(iteration)
+    share = config.expert_share(learner.sequences)
     began = time.monotonic()
     behaviors = show(drives, config.demonstrations // team.size, frames, gap, rng)
-    driver = learner.networks if share < 1.0 else None
+    driver = learner.networks if share < 1.0 or what is Learn.BEHAVIORS else None
     rollouts = roll_out(driver, drives, behaviors, config, rng, expert_share=share)
     rolled = time.monotonic()
     for _ in range(config.epochs):
         for chosen in _minibatches(rollouts, config.minibatch // team.size, rng):
-            learn.behaviors(behaviors, rollouts, chosen)
+            learn.behaviors(behaviors, rollouts, chosen, what)
     row = learn.means()
     row |= {"frames": behaviors.images.shape[1], "gap": gap, "expert_share": share}
     row |= {"collided": float(rollouts.collided.mean())}
@@ -132,33 +133,45 @@ class Updates:
         self._sums: dict[str, float] = {}
         self._count = 0
 
-    def behaviors(self, behaviors: Behaviors, rollouts: Rollouts, chosen: NDArray[np.intp]) -> None:
+    def behaviors(
+        self, behaviors: Behaviors, rollouts: Rollouts, chosen: NDArray[np.intp], what: Learn
+    ) -> None:
         """Learn from repetitions `chosen` and, beside them, from views."""
         learner, config = self._learner, self._learner.config
         batch = losses.Minibatch.build(
-            behaviors, rollouts, chosen, config, self._rng, learner.device
+            behaviors,
+            rollouts,
+            chosen,
+            config,
+            self._rng,
+            learner.device,
+            look_again=what is Learn.ALL,
         )
         with self._arithmetic():
             loss, parts = losses.compute(learner.networks, learner.heads, batch, config.loss)
         learner.sequences += len(chosen) * self._team.size
-        self._step(loss, parts, config.view_groups)
+        if what is Learn.ALL:
+            seeing, also = self._relate(config.view_groups)
+            loss, parts = loss + seeing, parts | also
+        self._step(loss, parts)
 
     def views(self) -> None:
         """Learn from views alone."""
-        self._step(
-            torch.zeros((), device=self._learner.device), {}, self._learner.config.view_groups_alone
-        )
+        self._step(*self._relate(self._learner.config.view_groups_alone))
 
     def means(self) -> dict[str, float]:
         """Mean of each loss and of the gradient's norm."""
         return {name: value / self._count for name, value in self._sums.items()}
 
-    def _step(self, loss: Tensor, parts: dict[str, float], groups: int) -> None:
-        learner, config, rng = self._learner, self._learner.config, self._rng
+    def _relate(self, groups: int) -> tuple[Tensor, dict[str, float]]:
+        learner, rng = self._learner, self._rng
         seen = views.draw(self._drives, groups // self._team.size, rng)
+        weights = learner.config.loss
         with self._arithmetic():
-            error = losses.relate(learner.networks, learner.heads, seen, rng, learner.device)
-        loss = loss + config.loss.views * error
+            return losses.relate(learner.networks, learner.heads, seen, weights, rng)
+
+    def _step(self, loss: Tensor, parts: dict[str, float]) -> None:
+        learner, config = self._learner, self._learner.config
         warm = min(1.0, (learner.updates + 1) / config.warmup_updates)
         for group in learner.optimizer.param_groups:
             group["lr"] = config.learning_rate * warm * self._decay
@@ -170,7 +183,7 @@ class Updates:
             learner.optimizer.step()
         learner.updates += 1
         learner.update_average()
-        for name, value in {**parts, "views": float(error.detach()), "norm": float(norm)}.items():
+        for name, value in {**parts, "norm": float(norm)}.items():
             self._sums[name] = self._sums.get(name, 0.0) + value
         self._count += 1
 
