@@ -8,7 +8,9 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import onnx
+import onnx.numpy_helper
 import torch
 
 from cbe import signature
@@ -21,6 +23,7 @@ from cbe_training.networks import BehaviorNetworks
 
 TOLERANCE = 1e-4
 LEAST_TICKS = 200
+LARGE = 1024  # numbers: smaller tensors are not worth a node
 OPSET = 18
 
 logger = logging.getLogger(__name__)
@@ -44,7 +47,7 @@ def export(
     Raises ModelError, writing nothing, if onnxruntime differs from torch by more than 1e-4
     anywhere in at least 200 ticks of real rollouts.
     """
-    networks = load_networks(checkpoint)
+    networks = load_networks(checkpoint).half().float()  # stored in half precision
     rides = Rides.record(networks, cache)
     with tempfile.TemporaryDirectory() as scratch:
         staging = Path(scratch)
@@ -116,7 +119,29 @@ def write_graphs(
                 verbose=False,
             )
         model = onnx.load(path)
+        store_in_half(model)
         onnx.helper.set_model_props(model, metadata)
         onnx.checker.check_model(model, full_check=True)
         onnx.save(model, path)
     return model_id
+
+
+def store_in_half(model: onnx.ModelProto) -> None:
+    """Store large weights as float16 where nothing is lost, cast back as the session is made."""
+    graph = model.graph
+    casts = []
+    for tensor in graph.initializer:
+        value = onnx.numpy_helper.to_array(tensor)
+        if value.dtype != np.float32 or value.size < LARGE:
+            continue
+        half = value.astype(np.float16)
+        if not np.array_equal(half, value):
+            continue
+        name = tensor.name
+        tensor.CopyFrom(onnx.numpy_helper.from_array(half, f"{name}.half"))
+        casts.append(
+            onnx.helper.make_node("Cast", [tensor.name], [name], to=onnx.TensorProto.FLOAT)
+        )
+    nodes = [*casts, *graph.node]
+    del graph.node[:]
+    graph.node.extend(nodes)
