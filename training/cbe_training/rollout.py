@@ -100,38 +100,23 @@ def roll_out(
     start midway; outside it the robot stops itself where its progress says it has arrived.
     """
     robot, controller = Robot(), RmpController()
-    shown = np.repeat(np.arange(len(behaviors.world)), config.repeats)
-    count, gap = len(shown), behaviors.gap
-    paths, world = behaviors.paths.take(shown), behaviors.world[shown]
-    driven = shown.copy()
-    wrong = rng.random(count) < (config.wrong_episodes if training else 0.0)
-    shown = np.where(
-        wrong, (shown + 1 + rng.integers(0, len(behaviors.world) - 1)) % len(behaviors.world), shown
-    )
-    wrong = behaviors.world[shown] != world  # the same world could overlap
-    shown = np.where(wrong, shown, driven)
-    joining = (rng.random(count) < (config.joining_episodes if training else 0.0)) & ~wrong
-    last = np.where(joining, rng.integers(0, paths.length * 6 // 10), 0)
-    expert_only = rng.random(count) < (config.expert_episodes if training else 0.0)
-    wobble_rad = rng.choice(NOISE_RAD, count)
-    vehicle = Vehicle(
-        _jitter(drives, world, paths.poses[np.arange(count), last], config, rng),
-        robot,
-        noise=noise,
-        rng=rng,
-    )
+    cast = _Cast.draw(behaviors, config, rng, training=training)
+    count, gap = len(cast.driven), behaviors.gap
+    paths, world = behaviors.paths.take(cast.driven), behaviors.world[cast.driven]
+    last = cast.first.copy()
+    starts = _jitter(drives, world, paths.poses[np.arange(count), last], config, rng)
+    vehicle = Vehicle(starts, robot, noise=noise, rng=rng)
     vehicle.speed_mps = np.where(rng.random(count) < 0.5, rng.uniform(0.0, 0.5, count), 0.0)
-    cameras = appearance.vary(rng, behaviors.cameras.take(driven))
-    policy = shown_seen = None
+    cameras = appearance.vary(rng, behaviors.cameras.take(cast.driven))
+    longest = int(behaviors.images.shape[1] * (1.3 if training else 2.0)) + 8
+    out = _empty(count, longest, behaviors, cast)
+    policy = None
     if networks is not None:
         memory, shown_seen = memorise(networks, behaviors.images)
-        policy = Policy(networks, memory.take(shown))
-
-    longest = int(behaviors.images.shape[1] * (1.3 if training else 2.0)) + 8
-    out = _empty(count, longest, behaviors, shown, driven)
-    if shown_seen is not None:
+        policy = Policy(networks, memory.take(cast.shown))
         seen = Seen(*(new.new_zeros(count, longest, new.shape[-1]) for new in shown_seen))
         out = replace(out, seen=seen, shown_seen=shown_seen)
+
     active = np.ones(count, np.bool_)
     past_goal, off_route, nearly = np.zeros((3, count), np.int64)
     angle = np.zeros(count)
@@ -145,18 +130,19 @@ def roll_out(
         )
         labels = track.label(paths.take(rows), poses, last[rows], config.lookahead_m)
         last[rows] = labels.closest
+        on_route = (labels.distance_m < config.off_route_m) & ~cast.wrong[rows]
         out.images[rows, tick], out.poses[rows, tick] = images, poses
         out.waypoint_m[rows, tick], out.progress[rows, tick] = labels.waypoint_m, labels.progress
-        out.on_route[rows, tick] = (labels.distance_m < config.off_route_m) & ~wrong[rows]
+        out.on_route[rows, tick] = on_route
         out.frames[rows] += 1
 
-        angle = 0.8 * angle + 0.6 * wobble_rad * rng.standard_normal(count)
+        angle = 0.8 * angle + 0.6 * cast.wobble_rad * rng.standard_normal(count)
         waypoint = _turn(labels.waypoint_m, angle[rows])
         if policy is not None:
             own, progress, _ = policy.tick(rows, images)
             for kept, new in zip(out.seen or (), policy.seen, strict=True):
                 kept[rows, tick] = new[:, 0]
-            mine = (rng.random(len(rows)) >= expert_share) & ~expert_only[rows]
+            mine = (rng.random(len(rows)) >= expert_share) & ~cast.expert_only[rows]
             waypoint = np.where(mine[:, None], own, waypoint)
             nearly[rows] = np.where(progress >= 0.95, nearly[rows] + 1, 0)
             if not training:
@@ -175,12 +161,53 @@ def roll_out(
     return out
 
 
+@dataclass(frozen=True, slots=True)
+class _Cast:
+    """Who of B robots is shown what, and how it is to drive."""
+
+    shown: NDArray[np.int64]  # (B,) behavior whose memory it gets
+    driven: NDArray[np.int64]  # (B,) behavior it starts on and is labelled by
+    wrong: NDArray[np.bool_]  # (B,) whether they differ
+    first: NDArray[np.int64]  # (B,) sample of its path it starts at
+    expert_only: NDArray[np.bool_]  # (B,)
+    wobble_rad: NDArray[np.float64]  # (B,) noise of the expert's waypoint
+
+    @classmethod
+    def draw(
+        cls,
+        behaviors: Behaviors,
+        config: TrainConfig,
+        rng: np.random.Generator,
+        *,
+        training: bool,
+    ) -> "_Cast":
+        total = len(behaviors.world)
+        driven = np.repeat(np.arange(total), config.repeats)
+        count = len(driven)
+        if not training:
+            none = np.zeros(count, np.bool_)
+            return cls(driven, driven, none, np.zeros(count, np.int64), none, np.zeros(count))
+        other = (driven + 1 + rng.integers(0, total - 1, count)) % total
+        # Another behavior of the same world could overlap.
+        elsewhere = behaviors.world[other] != behaviors.world[driven]
+        wrong = (rng.random(count) < config.wrong_episodes) & elsewhere
+        joining = (rng.random(count) < config.joining_episodes) & ~wrong
+        middle = rng.integers(0, behaviors.paths.length[driven] * 6 // 10)
+        return cls(
+            shown=np.where(wrong, other, driven),
+            driven=driven,
+            wrong=wrong,
+            first=np.where(joining, middle, 0),
+            expert_only=rng.random(count) < config.expert_episodes,
+            wobble_rad=rng.choice(NOISE_RAD, count),
+        )
+
+
 def _empty(
     count: int,
     longest: int,
     behaviors: Behaviors,
-    shown: NDArray[np.int64],
-    driven: NDArray[np.int64],
+    cast: _Cast,
 ) -> Rollouts:
     return Rollouts(
         images=np.zeros((count, longest, *behaviors.images.shape[2:]), np.uint8),
@@ -189,10 +216,10 @@ def _empty(
         progress=np.zeros((count, longest), np.float32),
         on_route=np.zeros((count, longest), np.bool_),
         frames=np.zeros(count, np.int64),
-        shown=shown,
-        driven=driven,
-        goals=behaviors.paths.goals[shown],
-        starts=behaviors.paths.poses[shown, 0],
+        shown=cast.shown,
+        driven=cast.driven,
+        goals=behaviors.paths.goals[cast.shown],
+        starts=behaviors.paths.poses[cast.shown, 0],
         arrived=np.zeros(count, np.bool_),
         collided=np.zeros(count, np.bool_),
         success=np.zeros(count, np.bool_),
