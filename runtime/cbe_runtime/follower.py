@@ -34,8 +34,10 @@ class FollowerConfig:
     fresh_s: float = 0.3  # an older image or scan stops the robot
     switch_progress: float = 0.95  # phi >= 0.95 starts the next behavior, Sec. III-D
     arrival_progress: float = 0.95  # the same on the last behavior means ARRIVED
-    resting_progress: float = 0.85  # enough for ARRIVED where the waypoint says to rest here:
+    resting_progress: float = 0.85  # enough where the waypoint says that the end is here:
     resting_range_m: float = 0.12  # a progress that stalls below the threshold must not strand it
+    final_range_m: float = 0.4  # a waypoint nearer than this is the end of the behavior:
+    final_bearing_rad: float = 0.15  # come in straight, a little beside it rather than turned
     progress_ticks: int = 2  # network ticks in a row that must agree, against flicker
     timeout_factor: float = 3.0  # a segment may take this many times the demonstration's steps
     timeout_steps: int = 100  # ... and this many more
@@ -190,8 +192,8 @@ class Follower:
         """Start the next behavior, or arrive, once enough ticks in a row say so."""
         last, config = self._behavior.last, self._config
         done = prediction.progress >= (config.arrival_progress if last else config.switch_progress)
-        if last and prediction.progress >= config.resting_progress:
-            done |= math.hypot(*prediction.waypoint_m) < config.resting_range_m
+        if self._ending():
+            done |= prediction.waypoint_m[0] < config.resting_range_m
         self._done_ticks = self._done_ticks + 1 if done else 0
         if self._done_ticks < config.progress_ticks:
             return
@@ -227,13 +229,29 @@ class Follower:
             self._command = (0.0, 0.0)
         else:
             scan_m = ranges_m[None]  # (1, rays)
-            goal_m = np.array([self._waypoint_m])  # (1, 2)
+            goal_m = np.array([self._aim()])  # (1, 2)
             motion = self._controller.step(self._motion, goal_m, scan_m)
             if state is State.ARRIVED:
                 motion = self._coast(motion)
             self._motion = limit(motion, scan_m, self._robot)
             speed, yaw_rate = twist(self._motion, self._robot)
             self._command = (float(speed[0]), float(yaw_rate[0]))
+
+    def _ending(self) -> bool:
+        """Whether the waypoint is the end of the behavior."""
+        assert self._prediction is not None
+        assert self._waypoint_m is not None
+        near = math.hypot(*self._waypoint_m) < self._config.final_range_m
+        return near and self._prediction.progress >= self._config.resting_progress
+
+    def _aim(self) -> tuple[float, float]:
+        """Where to drive to: the waypoint, but no sharp turn for its last decimetres."""
+        assert self._waypoint_m is not None
+        x, y = self._waypoint_m
+        if not self._ending():
+            return x, y
+        most = max(x, 0.0) * math.tan(self._config.final_bearing_rad)
+        return x, min(max(y, -most), most)
 
     def _coast(self, motion: Motion) -> Motion:
         """Come to rest at the last waypoint: never faster than before, nor than can be braked."""

@@ -109,10 +109,10 @@ def test_single_tick_of_high_progress_does_not_switch(drive, monkeypatch):
     assert drive.step(4).segment == 0
 
 
-def _saying(drive, monkeypatch, **said):
-    """Have the generator say this from now on, on the route's last segment."""
+def _saying(drive, monkeypatch, segment=1, **said):
+    """Have the generator say this from now on; the route's last segment is 1."""
     drive.step()
-    drive.follower._begin(1)
+    drive.follower._begin(segment)
     generate = Networks.generate
 
     def fixed(self, **inputs):
@@ -135,6 +135,25 @@ def test_stalled_progress_arrives_only_where_the_waypoint_says_rest(
 ):
     _saying(drive, monkeypatch, progress=progress, waypoint_m=np.array([waypoint_x_m, 0.0]))
     assert drive.step(6).state is state
+
+
+def test_stalled_progress_switches_where_the_waypoint_says_rest(drive, monkeypatch):
+    _saying(drive, monkeypatch, segment=0, progress=0.9, waypoint_m=np.array([0.05, 0.0]))
+    assert drive.step(6).segment == 1
+
+
+def test_arrives_abreast_of_a_waypoint_too_near_to_turn_to(drive, monkeypatch):
+    _saying(drive, monkeypatch, progress=0.9, waypoint_m=np.array([0.05, 0.25]))
+    assert drive.step(6).state is State.ARRIVED
+
+
+@pytest.mark.parametrize(("progress", "turns"), [(0.5, True), (0.9, False)])
+def test_no_sharp_turn_for_the_last_decimetres(drive, monkeypatch, progress, turns):
+    _saying(drive, monkeypatch, progress=progress, waypoint_m=np.array([0.25, 0.25]))
+    decision = drive.step(8)
+    assert decision.state is State.FOLLOWING
+    curvature_per_m = decision.yaw_rate_rad_s / decision.speed_mps
+    assert (curvature_per_m > 1.5) == turns
 
 
 def test_arrives_and_comes_to_rest_at_the_last_waypoint(drive):
