@@ -43,6 +43,25 @@ def _parser() -> argparse.ArgumentParser:
     sweep.add_argument("--plot", type=Path, metavar="FILE", help="write the curve")
     sweep.set_defaults(run=_sweep)
 
+    ablation = commands.add_parser("ablation", help="what each part of the memory is worth")
+    ablation.add_argument("--steps", type=int, default=128, help="length, 0.1 s each (%(default)s)")
+    _add_run_options(ablation)
+    ablation.add_argument(
+        "--cloned", type=Path, metavar="DIR", help="also run this model, trained without DAgger"
+    )
+    ablation.set_defaults(run=_ablation)
+
+    manifold = commands.add_parser("manifold", help="map the embeddings of many demonstrations")
+    manifold.add_argument("--steps", type=int, default=100, help="length, 0.1 s each (%(default)s)")
+    manifold.add_argument("--episodes", type=int, default=1000, help="how many (%(default)s)")
+    manifold.add_argument("--seed", type=int, default=0, help="of worlds, drives and map")
+    manifold.add_argument("--world", choices=("val", "test"), default="test")
+    manifold.add_argument("--model", type=Path, metavar="DIR", help="folder of ONNX files")
+    manifold.add_argument("--jobs", type=int, default=0, metavar="N", help="processes (one a core)")
+    manifold.add_argument("--plot", type=Path, metavar="FILE", help="write the map")
+    manifold.add_argument("--json", type=Path, metavar="FILE", help="write the result")
+    manifold.set_defaults(run=_manifold)
+
     compare = commands.add_parser("compare", help="compare two results episode by episode")
     compare.add_argument("a", type=Path, help="JSON of cbe-bench single")
     compare.add_argument("b", type=Path, help="JSON of cbe-bench single")
@@ -144,6 +163,25 @@ def _sweep(options: argparse.Namespace) -> None:
         )
     if options.plot:
         sweep.draw(result, options.plot)
+
+
+def _ablation(options: argparse.Namespace) -> None:
+    from cbe_bench import ablation
+
+    result = ablation.ablate(_config(options, options.steps), options.cloned)
+    _write(options.json, result)
+    _say(ablation.table(result))
+
+
+def _manifold(options: argparse.Namespace) -> None:
+    from cbe_bench import manifold
+
+    config = manifold.ManifoldConfig(
+        options.world, options.steps, options.episodes, options.seed, _model(options), options.jobs
+    )
+    result = manifold.measure(config, options.plot)
+    _write(options.json, result)
+    _say(manifold.table(result))
 
 
 def _compare(options: argparse.Namespace) -> None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from cbe.camera import MODEL_CAMERA
 from cbe.errors import ConfigError
 from cbe_bench.episode import Outcome, Ride, film, ride
+from cbe_bench.memory import Memory
 from cbe_bench.place import BACKENDS, Bin, Place, is_scene, world_seeds
 from cbe_bench.scenario import BIN_MARGIN_SAMPLES, GROUP, Scenario, Terms, scenarios
 from cbe_bench.tally import Record, summary
@@ -38,6 +39,7 @@ class SingleConfig:
     noise: float = 0.0
     model: Path = PACKAGED_MODELS
     jobs: int = 0  # 0 takes a process a core
+    memory: Memory = Memory.FULL
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
@@ -68,6 +70,7 @@ class SingleConfig:
             "world_seeds": None if seeds is None else f"{seeds.start}:{seeds.stop}",
             "backend": self.backend,
             "noise": self.noise,
+            "memory": self.memory.value,
         }
 
 
@@ -122,7 +125,7 @@ def drive(networks: Networks, config: SingleConfig, place: Place, scenario: Scen
     """Teach the scenario's demonstration as one behavior and repeat it."""
     with place.backend() as (backend, see):
         route = teach(networks, film(backend, see, scenario.demonstration))
-    follower = Follower(networks, route)
+    follower = Follower(networks, config.memory.of(route))
     rng = np.random.default_rng([config.terms.seed, scenario.index, 1])
     with place.backend(noise=config.noise, rng=rng, bin_=scenario.bin_) as (backend, see):
         return ride(follower, backend, see, scenario.demonstration, scenario.start)
@@ -140,7 +143,7 @@ def teach(networks: Networks, views: Sequence[NDArray[np.uint8]]) -> Route:
 
 def _drive_group(config: SingleConfig, seeds: Sequence[int], group: int, count: int) -> list[Trace]:
     """One process's task: the first `count` episodes of a group."""
-    _use_one_thread()
+    use_one_thread()
     networks = _networks(config.model)
     with ExitStack() as places:
 
@@ -160,7 +163,7 @@ def _networks(folder: Path) -> Networks:
     return Networks.load(folder)
 
 
-def _use_one_thread() -> None:
+def use_one_thread() -> None:
     """Processes share the cores already; threads in each would only wait for one another."""
     import cv2
     import numba
