@@ -46,7 +46,11 @@ class Link:
 
     @classmethod
     def open(cls, config: LinkConfig) -> Link:
-        """Connect and listen; raises LinkError within `open_timeout_s` where that fails."""
+        """Connect and listen; raises LinkError within `open_timeout_s` where that fails.
+
+        Raises ConfigError, before anything is opened, for certificates that cannot work.
+        """
+        config.check()
         settings = zenoh.Config()
         for key, value in config.zenoh_json5().items():
             settings.insert_json5(key, value)
@@ -137,7 +141,10 @@ class Link:
                     raise LinkError(f"no answer from {key} within {timeout_s:g} s")
                 raise LinkError(f"{key} answered: {reason}")
             if time.monotonic() >= deadline:
-                raise LinkError(f"nobody answers {key}; is the process that serves it running?")
+                allowed = ", and may this certificate call it" if self.config.tls else ""
+                raise LinkError(
+                    f"nobody answers {key}; is the process that serves it running{allowed}?"
+                )
             time.sleep(RETRY_S)
 
     def declare_alive(self, process: str) -> None:
@@ -245,8 +252,12 @@ def _why_not_open(config: LinkConfig, error: Exception) -> str:
     endpoints = ", ".join((*config.connect, *config.listen))
     reason = str(error).split(" at /")[0]  # the rest names a file of the library
     if config.connect and "connect" in reason:
+        # Zenoh does not say why: a refused certificate looks like an absent robot.
+        refused = ", or check that both sides' certificates are of one authority and that the "
+        refused += "other's names that host"
         return (
             f"no answer from {', '.join(config.connect)} within {config.open_timeout_s:g} s; "
             "start the robot or simulator that listens there, or name another endpoint"
+            f"{refused if config.tls else ''}"
         )
     return f"cannot open the link on {endpoints}: {reason}"

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from cbe.camera import MODEL_CAMERA
 from cbe.errors import CbeError, ConfigError
 from cbe.link import Link
-from cbe.linkconfig import LOOPBACK, LinkConfig
+from cbe.linkconfig import LOOPBACK, LinkConfig, loopback
+from cbe.linkoptions import add_security, security
 from cbe.robot import Robot
 from cbe.topics import KeyStyle
 from cbe_hil_sim.process import ProcessConfig, RobotProcess
@@ -120,16 +121,18 @@ def _parser() -> argparse.ArgumentParser:
         help="keys of ROS 2 nodes on rmw_zenoh (default), or bare names as "
         "zenoh-bridge-ros2dds uses",
     )  # fmt: skip
+    add_security(parser)
     return parser
 
 
 def _link_config(options: argparse.Namespace) -> LinkConfig:
     names: dict[str, Any] = {
         "robot": options.robot, "domain": options.domain, "style": KeyStyle(options.key_style),
-    }  # fmt: skip
+    } | security(options)  # fmt: skip
     if options.connect and not options.listen:
         return LinkConfig(connect=tuple(options.connect), **names)
-    connect, listen = tuple(options.connect or ()), tuple(options.listen or (LOOPBACK,))
+    connect = tuple(options.connect or ())
+    listen = tuple(options.listen or (loopback(names.get("tls")),))
     return LinkConfig(mode="router", connect=connect, listen=listen, **names)
 
 

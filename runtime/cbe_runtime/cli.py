@@ -41,6 +41,11 @@ def route_main(arguments: Arguments = None) -> int:
     return _run("cbe-route", "command_route", arguments)
 
 
+def keys_main(arguments: Arguments = None) -> int:
+    """`cbe-keys`: make certificates."""
+    return _run("cbe-keys", "command_keys", arguments)
+
+
 def _run(program: str, module: str, arguments: Arguments) -> int:
     """Import only the command in question: a board starts faster."""
     command = importlib.import_module(f"cbe_runtime.{module}")

@@ -12,7 +12,8 @@ import msgspec
 
 from cbe.camera import CameraModel
 from cbe.errors import CameraError, ConfigError
-from cbe.linkconfig import LOOPBACK, LinkConfig
+from cbe.linkconfig import LOOPBACK, LinkConfig, loopback
+from cbe.linkoptions import add_security, security
 from cbe.topics import KeyStyle
 from cbe_runtime.follower import FollowerConfig
 from cbe_runtime.networks import PACKAGED_MODELS
@@ -22,7 +23,7 @@ TABLES = ("camera", "follower")
 
 
 def add_link(parser: argparse.ArgumentParser) -> None:
-    """--connect, --listen, --robot, --domain, --key-style."""
+    """--connect, --listen, --robot, --domain, --key-style, and those of `add_security`."""
     group = parser.add_argument_group("link")
     group.add_argument(
         "--connect",
@@ -49,18 +50,20 @@ def add_link(parser: argparse.ArgumentParser) -> None:
         help="keys of ROS 2 nodes on rmw_zenoh (default), or bare names as "
         "zenoh-bridge-ros2dds uses",
     )
+    add_security(parser)
 
 
 def link_config(options: argparse.Namespace) -> LinkConfig:
     """The link that these options ask for.
 
     Raises:
-        ConfigError: an endpoint or name is malformed.
+        ConfigError: an endpoint or name is malformed, or certificates are missing.
     """
     style = KeyStyle(options.key_style)
     names: dict[str, Any] = {"robot": options.robot, "domain": options.domain, "style": style}
+    names |= security(options)
     if not options.listen:
-        return LinkConfig(connect=tuple(options.connect or (LOOPBACK,)), **names)
+        return LinkConfig(connect=tuple(options.connect or (loopback(names.get("tls")),)), **names)
     return LinkConfig(
         mode="router",
         connect=tuple(options.connect or ()),

@@ -304,7 +304,7 @@ def test_configuration_that_cannot_work_is_refused(bad: dict[str, Any]) -> None:
 
 def test_only_endpoints_beyond_loopback_count_as_exposed() -> None:
     inside = ("tcp/127.0.0.1:1", "tcp/[::1]:1", "tcp/localhost:1", "unixsock-stream//tmp/x")
-    outside = ("tcp/0.0.0.0:1", "tcp/[::]:1", "tls/robot.local:1")
+    outside = ("tcp/0.0.0.0:1", "tcp/[::]:1", "udp/robot.local:1")
     assert LinkConfig.hub(*inside, *outside).exposed == outside
     assert LinkConfig.hub().exposed == ()
 
