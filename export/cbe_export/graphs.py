@@ -4,7 +4,10 @@ import torch
 from torch import Tensor, nn
 
 from cbe import signature
-from cbe_training.networks import BehaviorNetworks
+from cbe_training.losses import AuxiliaryHeads
+from cbe_training.networks import STEP_SCALE, BehaviorNetworks, add_up, place
+
+POSE = 3
 
 
 class LstmCell(nn.Module):
@@ -26,13 +29,14 @@ class LstmCell(nn.Module):
 
 
 class EncoderTick(nn.Module):
-    """Graph `encoder`."""
+    """Graph `encoder`; the dead-reckoned pose travels as the last three numbers of `h`."""
 
     def __init__(self, networks: BehaviorNetworks) -> None:
         super().__init__()
         self.trunk = networks.trunk
         self.pair = networks.encoder.pair
         self.lstm = LstmCell(networks.encoder.lstm)
+        self.odometry = networks.encoder.odometry
         self.to_embedding = networks.encoder.to_embedding
 
     def forward(
@@ -44,8 +48,14 @@ class EncoderTick(nn.Module):
         previous = first * features + (1.0 - first) * previous_features
         # A new behavior starts from nothing, whatever state was passed in.
         h, c = (1.0 - is_first) * h, (1.0 - is_first) * c
-        h, c = self.lstm(self.pair(features, previous), h, c)
-        return features, self.to_embedding(h), h, c
+        h, pose = h.split([h.shape[1] - POSE, POSE], dim=1)
+        c, spare = c.split([c.shape[1] - POSE, POSE], dim=1)
+        motion = self.pair(features, previous)
+        step = (1.0 - is_first) * self.odometry(motion) / STEP_SCALE
+        pose = add_up(step[:, None], pose)[:, 0]
+        h, c = self.lstm(torch.cat([motion, place(pose)], dim=1), h, c)
+        embedding = self.to_embedding(torch.cat([h, place(pose)], dim=1))
+        return features, embedding, torch.cat([h, pose], dim=1), torch.cat([c, spare], dim=1)
 
 
 class AttractorTick(nn.Module):
@@ -94,11 +104,31 @@ class GeneratorTick(nn.Module):
         return out[:, :2], out[:, 2], torch.sigmoid(out[:, 3]), h, c
 
 
-def ticks(networks: BehaviorNetworks) -> list[tuple[signature.Graph, nn.Module]]:
-    """The three graphs with the modules that compute them."""
+class ShapeTick(nn.Module):
+    """Graph `shape`."""
+
+    def __init__(self, heads: AuxiliaryHeads) -> None:
+        super().__init__()
+        self.shape = heads.shape
+
+    def forward(self, embedding: Tensor) -> Tensor:
+        """See `cbe.signature.shape`."""
+        return self.shape(embedding).view(1, signature.SHAPE_POINTS, 2)
+
+
+def encoder_signature(networks: BehaviorNetworks) -> signature.Graph:
+    """Tensors of the encoder: its state is the LSTM's and the pose."""
+    return signature.encoder(networks.config.encoder_state + POSE)
+
+
+def ticks(
+    networks: BehaviorNetworks, heads: AuxiliaryHeads
+) -> list[tuple[signature.Graph, nn.Module]]:
+    """All graphs with the modules that compute them."""
     config = networks.config
     return [
-        (signature.encoder(config.encoder_state), EncoderTick(networks)),
+        (encoder_signature(networks), EncoderTick(networks)),
         (signature.attractor(), AttractorTick(networks)),
         (signature.generator(config.generator_state), GeneratorTick(networks)),
+        (signature.shape(), ShapeTick(heads)),
     ]

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cbe import signature
+from cbe_export.graphs import encoder_signature
 from cbe_training.config import TrainConfig
 from cbe_training.drives import unseen
+from cbe_training.losses import AuxiliaryHeads
 from cbe_training.networks import BehaviorNetworks
 from cbe_training.rollout import roll_out, show
 
@@ -40,17 +42,19 @@ class Rides:
         return cls(done.images, done.frames, behaviors.images[done.shown])
 
 
-def worst_difference(networks: BehaviorNetworks, folder: Path, rides: Rides) -> tuple[float, int]:
-    """Largest difference of any generator or encoder output, and over how many ticks."""
+def worst_difference(
+    networks: BehaviorNetworks, heads: AuxiliaryHeads, folder: Path, rides: Rides
+) -> tuple[float, int]:
+    """Largest difference of any generator, encoder or shape output, and over how many ticks."""
     sessions = {
         name: onnxruntime.InferenceSession(
             str(folder / f"{name}.onnx"), providers=["CPUExecutionProvider"]
         )
-        for name in ("encoder", "attractor", "generator")
+        for name in ("encoder", "attractor", "generator", "shape")
     }
     worst, ticks = 0.0, 0
     for images, frames, shown in zip(rides.images, rides.frames, rides.shown, strict=True):
-        expected = _run_torch(networks, images[:frames], shown)
+        expected = _run_torch(networks, heads, images[:frames], shown)
         found = _run_onnx(networks, sessions, images[:frames], shown)
         worst = max(worst, float(np.abs(expected - found).max()))
         ticks += int(frames)
@@ -59,9 +63,12 @@ def worst_difference(networks: BehaviorNetworks, folder: Path, rides: Rides) -> 
 
 @torch.no_grad()
 def _run_torch(
-    networks: BehaviorNetworks, images: NDArray[np.uint8], shown: NDArray[np.uint8]
+    networks: BehaviorNetworks,
+    heads: AuxiliaryHeads,
+    images: NDArray[np.uint8],
+    shown: NDArray[np.uint8],
 ) -> NDArray[np.float32]:
-    """Waypoint, progress, on_route and embedding (T, 36), the sequence at once."""
+    """Waypoint, progress, on_route, embedding and its path (T, 52), the sequence at once."""
 
     def look(frames: NDArray[np.uint8]) -> tuple[Tensor, Tensor]:
         features = networks.trunk(torch.from_numpy(frames))
@@ -75,7 +82,7 @@ def _run_torch(
     to_start = relation(attractor[:1], goal[:1])[None].expand(1, steps, -1)
     out = networks.generator(to_goal, to_start, z, goal_z[:, -1:].expand(1, steps, -1))
     parts = [out.waypoint_m, out.progress[..., None], torch.sigmoid(out.on_route_logit)[..., None]]
-    return torch.cat([*parts, z], dim=-1)[0].numpy()
+    return torch.cat([*parts, z, heads.shape(z)], dim=-1)[0].numpy()
 
 
 def _run_onnx(
@@ -84,11 +91,10 @@ def _run_onnx(
     images: NDArray[np.uint8],
     shown: NDArray[np.uint8],
 ) -> NDArray[np.float32]:
-    """The same (T, 36), tick by tick."""
-    size = networks.config
+    """The same (T, 52), tick by tick."""
 
     def look(frames: NDArray[np.uint8]) -> tuple[Arrays, list[Arrays]]:
-        state = _zeros(signature.encoder(size.encoder_state))
+        state = _zeros(encoder_signature(networks))
         seen: list[Arrays] = []
         for index, image in enumerate(frames):
             state["image"] = image[None]
@@ -96,12 +102,13 @@ def _run_onnx(
             out = _call(sessions["encoder"], state)
             state |= {"previous_features": out["features"], "h": out["h_next"], "c": out["c_next"]}
             attractor = _call(sessions["attractor"], {"features": out["features"]})
-            seen.append({"embedding": out["embedding"], **attractor})
+            path = _call(sessions["shape"], {"embedding": out["embedding"]})
+            seen.append({"embedding": out["embedding"], **attractor, **path})
         return seen[-1], seen
 
     goal, memory = look(shown)
     _, seen = look(images)
-    state = _zeros(signature.generator(size.generator_state))
+    state = _zeros(signature.generator(networks.config.generator_state))
     state |= {
         "attractor_first": seen[0]["attractor"],
         "attractor_start": memory[0]["attractor"],
@@ -114,7 +121,7 @@ def _run_onnx(
         out = _call(sessions["generator"], state)
         state |= {"h": out["h_next"], "c": out["c_next"]}
         parts = [out["waypoint_m"][0], out["progress"], out["on_route"], now["embedding"][0]]
-        rows.append(np.concatenate(parts))
+        rows.append(np.concatenate([*parts, now["path_m"].reshape(-1)]))
     return np.stack(rows)
 
 

@@ -18,9 +18,10 @@ from cbe_training.train import iterate
 CONFIG = replace(
     TrainConfig(),
     worlds=2,
-    demonstrations=4,
+    demonstrations=6,
     minibatch=2,
-    view_groups_alone=2,
+    view_groups=2,
+    view_steps=4,
     view_updates=2,
     epochs=1,
     cloning_sequences=1,

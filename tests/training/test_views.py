@@ -26,10 +26,10 @@ def test_relations_of_a_pair_undo_each_other(drives: Drives) -> None:
     assert np.ptp(drawn.relation[..., 0]) > 0.5
 
 
-def test_views_that_move_show_where_from(drives: Drives) -> None:
-    drawn = views.draw(drives, 40, np.random.default_rng(3))
+def test_steps_are_as_short_and_as_curved_as_the_robot_drives(drives: Drives) -> None:
+    drawn = views.draw_steps(drives, 80, np.random.default_rng(3))
     length = np.hypot(drawn.motion[:, 0], drawn.motion[:, 1])
-    assert drawn.before.shape == (80, 64, 64, 3)
+    assert drawn.before.shape == drawn.now.shape == (80, 64, 64, 3)
     assert 0.1 < length.max() <= views.LONGEST_STEP_M + 1e-9
     assert (drawn.motion[:, 0] > 0.0).all()
     assert (abs(drawn.motion[:, 2]) <= views.CURVATURE_PER_M * length + 1e-9).all()
@@ -46,11 +46,14 @@ def test_networks_learn_to_relate_a_few_views(drives: Drives) -> None:
     networks = BehaviorNetworks()
     heads = AuxiliaryHeads(networks.config)
     drawn = views.draw(drives, 4, np.random.default_rng(1))
+    steps = views.draw_steps(drives, 8, np.random.default_rng(4))
     weights = LossWeights()
     optimizer = torch.optim.AdamW([*networks.parameters(), *heads.parameters()], lr=1e-3)
     errors = []
     for _ in range(120):
-        error, parts = losses.relate(networks, heads, drawn, weights, np.random.default_rng(2))
+        error, parts = losses.relate(
+            networks, heads, drawn, steps, weights, np.random.default_rng(2)
+        )
         optimizer.zero_grad()
         error.backward()
         optimizer.step()

@@ -31,13 +31,29 @@ def load_networks(folder: Path) -> BehaviorNetworks:
 
     Raises ModelError if the folder holds no checkpoint.
     """
-    state, weights = folder / "state.json", folder / "average.safetensors"
-    for path in (state, weights):
+    config, weights = _stored(folder, "average.safetensors")
+    networks = BehaviorNetworks(config)
+    networks.load_state_dict(weights)
+    return networks.eval()
+
+
+def load_heads(folder: Path) -> AuxiliaryHeads:
+    """The auxiliary heads of a checkpoint folder.
+
+    Raises ModelError if the folder holds none.
+    """
+    config, weights = _stored(folder, "heads.safetensors")
+    heads = AuxiliaryHeads(config)
+    heads.load_state_dict(weights)
+    return heads.eval()
+
+
+def _stored(folder: Path, name: str) -> tuple[NetworkConfig, dict[str, Tensor]]:
+    for path in (folder / "state.json", folder / name):
         if not path.is_file():
             raise ModelError(f"no checkpoint at {folder}: {path.name} is missing; run cbe-train")
-    networks = BehaviorNetworks(config_from_json(state.read_text()).network)
-    networks.load_state_dict(load_file(weights))
-    return networks.eval()
+    config = config_from_json((folder / "state.json").read_text()).network
+    return config, load_file(folder / name)
 
 
 def pack(run: Path, folder: Path) -> None:

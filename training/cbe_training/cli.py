@@ -30,6 +30,7 @@ def main() -> int:
         default=Learn.ALL.value,
         help="views: convolutions only; behaviors: all else, 3 times faster than all",
     )
+    parser.add_argument("--learning-rate", type=float, default=TrainConfig().learning_rate)
     parser.add_argument(
         "--decay-hours", type=float, default=0.0, help="let the learning rate fall at the end"
     )
@@ -50,7 +51,12 @@ def main() -> int:
     arguments = parser.parse_args()
     device = torch.device(arguments.device)
     workers = arguments.workers or (1 if device.type != "cpu" else os.cpu_count() or 1)
-    config = replace(TrainConfig(), seed=arguments.seed, worlds=arguments.worlds)
+    config = replace(
+        TrainConfig(),
+        seed=arguments.seed,
+        worlds=arguments.worlds,
+        learning_rate=arguments.learning_rate,
+    )
     bf16 = device.type == "cuda" if arguments.bf16 is None else arguments.bf16
     work = partial(
         _work,

@@ -10,12 +10,12 @@ from torch.nn import functional as F
 
 from cbe import geometry, signature
 from cbe_training.config import LossWeights, TrainConfig
-from cbe_training.networks import BehaviorNetworks, NetworkConfig, quantise
+from cbe_training.networks import STEP_SCALE, BehaviorNetworks, NetworkConfig, quantise
 from cbe_training.policy import Seen, look
 from cbe_training.rollout import Behaviors, Rollouts
-from cbe_training.views import GROUP, MOVING, NOW, TARGET, Views
+from cbe_training.views import GROUP, NOW, TARGET, Steps, Views
 
-SHAPE_POINTS = 8
+SHAPE_POINTS = signature.SHAPE_POINTS
 LEVELS = (0, 255, 15, 15)  # attractors stored exactly, at 8 bits, at 4 bits
 OVERLAP_M, OVERLAP_RAD = 2.0, np.radians(60.0)  # beyond, two views share too little
 
@@ -25,7 +25,6 @@ class AuxiliaryHeads(nn.Module):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        self.motion = nn.Linear(config.motion, 3)
         self.displacement = _perceptron(signature.EMBEDDING_SIZE, 4)
         self.shape = _perceptron(signature.EMBEDDING_SIZE, 2 * SHAPE_POINTS)
         self.relation = _perceptron(config.relation, 4)
@@ -170,21 +169,21 @@ def compute(
         ),
         "motion": 0.5
         * (
-            _mean(_distance(heads.motion(motion), batch.motion * 5.0), batch.valid)
-            + _mean(_distance(heads.motion(shown_motion), batch.shown_motion * 5.0), pair)
+            _mean(_motion_error(networks.encoder.step(motion), batch.motion), batch.valid)
+            + _mean(_motion_error(networks.encoder.step(shown_motion), batch.shown_motion), pair)
         ),
         "displacement": 0.5
         * (
-            _mean(_distance(heads.displacement(z), batch.displacement), batch.valid)
-            + _mean(_distance(heads.displacement(shown_z), batch.shown_displacement), pair)
+            _mean(_pose_error(heads.displacement(z), batch.displacement), batch.valid)
+            + _mean(_pose_error(heads.displacement(shown_z), batch.shown_displacement), pair)
         ),
         "shape": _distance(
             heads.shape(shown_z[:, -1]).view(shown, SHAPE_POINTS, 2),
             batch.shape.view(shown, SHAPE_POINTS, 2),
         ).mean(),
-        "relation": _mean(_distance(heads.relation(goal_relation), batch.goal), near)
+        "relation": _mean(_pose_error(heads.relation(goal_relation), batch.goal), near)
         + _mean(
-            _distance(heads.relation(start_relation), batch.start), _near(batch.start) & related
+            _pose_error(heads.relation(start_relation), batch.start), _near(batch.start) & related
         ),
     }
     total = torch.stack([getattr(weights, name) * part for name, part in parts.items()]).sum()
@@ -195,25 +194,27 @@ def relate(
     networks: BehaviorNetworks,
     heads: AuxiliaryHeads,
     views: Views,
+    steps: Steps,
     weights: LossWeights,
     rng: np.random.Generator,
 ) -> tuple[Tensor, dict[str, float]]:
     """Weighted loss and its parts: poses read off pairs of views, and off pairs of frames."""
     device = next(networks.parameters()).device
-    features = networks.trunk(torch.from_numpy(views.images).to(device))
-    attractors = networks.attractor(features)
+    attractors = networks.attractor(networks.trunk(torch.from_numpy(views.images).to(device)))
     levels = torch.from_numpy(rng.choice(LEVELS, (len(attractors), 1)).astype(np.float32))
     stored = quantise(attractors, levels.to(device)).view(-1, GROUP, signature.ATTRACTOR_SIZE)
     attractors = attractors.view(stored.shape)
     pose = torch.from_numpy(_vector(views.relation).astype(np.float32)).to(device)
     near = _near(pose)
     relation = networks.generator.relation(attractors[:, NOW][near], stored[:, TARGET][near])
-    related = _distance(heads.relation(relation), pose[near]).mean()
+    related = _pose_error(heads.relation(relation), pose[near]).mean()
 
-    before = networks.trunk(torch.from_numpy(views.before).to(device))
-    now = features.view(-1, GROUP, *features.shape[1:])[:, :MOVING].flatten(0, 1)
-    motion = torch.from_numpy(views.motion.astype(np.float32)).to(device)
-    moved = _distance(heads.motion(networks.encoder.pair(now, before)), motion * 5.0).mean()
+    before, now = (
+        networks.trunk(torch.from_numpy(images).to(device)) for images in (steps.before, steps.now)
+    )
+    motion = torch.from_numpy(steps.motion.astype(np.float32)).to(device)
+    step = networks.encoder.step(networks.encoder.pair(now, before))
+    moved = _motion_error(step, motion).mean()
     total = weights.views * (related + moved)
     return total, {"views": float(related.detach()), "view_motion": float(moved.detach())}
 
@@ -242,6 +243,17 @@ def _near(pose: Tensor) -> Tensor:
 
 def _distance(a: Tensor, b: Tensor) -> Tensor:
     return torch.linalg.vector_norm(a - b, dim=-1)
+
+
+def _pose_error(read: Tensor, pose: Tensor) -> Tensor:
+    """Of x, y, cos, sin (..., 4): apart, for far views' positions would drown what turns cost."""
+    return _distance(read[..., :2], pose[..., :2]) + 2.0 * _distance(read[..., 2:], pose[..., 2:])
+
+
+def _motion_error(read: Tensor, motion: Tensor) -> Tensor:
+    """Of the step `read` against x, y, yaw (..., 3), scaled to be about 1."""
+    moved = _distance(read[..., :2], motion[..., :2])
+    return STEP_SCALE * (moved + 2.0 * (read[..., 2] - motion[..., 2]).abs())
 
 
 def _mean(value: Tensor, mask: Tensor) -> Tensor:

@@ -29,8 +29,18 @@ class NetworkConfig:
     head: int = 128
 
 
-ATTRACTOR_SHAPE = (8, 5, 10)  # channels, rows, columns of signature.ATTRACTOR_SIZE numbers
+ATTRACTOR_SHAPE = signature.ATTRACTOR_SHAPE
+PLACE, PLACE_M = 4, 3.0
+STEP_SCALE = 5.0
 State = tuple[Tensor, Tensor]  # h, c of an LSTM, each (1, B, size)
+
+
+class EncoderState(NamedTuple):
+    """What the encoder carries on: its LSTM's h and c (1, B, size), dead-reckoned pose (B, 3)."""
+
+    h: Tensor
+    c: Tensor
+    pose: Tensor
 
 
 class Generated(NamedTuple):
@@ -94,18 +104,58 @@ class Pair(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Motion features gathered by an LSTM into the embedding z (paper, Sec. III-B)."""
+    """Motion features gathered by an LSTM into the embedding z (paper, Sec. III-B).
+
+    Beside it the steps read off the features are added up to a dead-reckoned pose, which both
+    the LSTM and z see: an LSTM is slow to learn that sum by itself, and never exact.
+    """
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.pair = Pair(config)
-        self.lstm = nn.LSTM(config.motion, config.encoder_state, batch_first=True)
-        self.to_embedding = nn.Linear(config.encoder_state, signature.EMBEDDING_SIZE)
+        self.odometry = nn.Linear(config.motion, 3)
+        self.lstm = nn.LSTM(config.motion + PLACE, config.encoder_state, batch_first=True)
+        self.to_embedding = nn.Linear(config.encoder_state + PLACE, signature.EMBEDDING_SIZE)
 
-    def forward(self, motion: Tensor, state: State | None = None) -> tuple[Tensor, State]:
-        """Motion (B, T, motion) to embeddings (B, T, 32) and the LSTM's state."""
-        hidden, state = self.lstm(motion, state)
-        return self.to_embedding(hidden), state
+    def forward(
+        self, motion: Tensor, state: EncoderState | None = None
+    ) -> tuple[Tensor, EncoderState]:
+        """Motion (B, T, motion) to embeddings (B, T, 32) and the state after the last frame.
+
+        Without a state the first frame is a behavior's first.
+        """
+        step = self.step(motion)
+        if state is None:
+            step = torch.cat([torch.zeros_like(step[:, :1]), step[:, 1:]], dim=1)
+            pose = add_up(step, step.new_zeros(len(step), 3))
+            hidden, (h, c) = self.lstm(torch.cat([motion, place(pose)], dim=-1))
+        else:
+            pose = add_up(step, state.pose)
+            inputs = torch.cat([motion, place(pose)], dim=-1)
+            hidden, (h, c) = self.lstm(inputs, (state.h, state.c))
+        embedding = self.to_embedding(torch.cat([hidden, place(pose)], dim=-1))
+        return embedding, EncoderState(h, c, pose[:, -1])
+
+    def step(self, motion: Tensor) -> Tensor:
+        """Features (..., motion) to x, y in m and yaw in rad (..., 3) in the frame before's."""
+        return self.odometry(motion) / STEP_SCALE
+
+
+def add_up(steps: Tensor, start: Tensor) -> Tensor:
+    """Poses (B, T, 3) after each of `steps` (B, T, 3) from `start` (B, 3)."""
+    turned = steps[..., 2]
+    yaw = start[:, None, 2] + turned.cumsum(dim=1)
+    before = yaw - turned
+    cos, sin = before.cos(), before.sin()
+    x = start[:, None, 0] + (cos * steps[..., 0] - sin * steps[..., 1]).cumsum(dim=1)
+    y = start[:, None, 1] + (sin * steps[..., 0] + cos * steps[..., 1]).cumsum(dim=1)
+    return torch.stack([x, y, yaw], dim=-1)
+
+
+def place(pose: Tensor) -> Tensor:
+    """Poses (..., 3) as a network likes them: (..., 4) of unit size."""
+    yaw = pose[..., 2:]
+    return torch.cat([pose[..., :2] / PLACE_M, yaw.cos(), yaw.sin()], dim=-1)
 
 
 class Attractor(nn.Module):

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cbe import signature
-from cbe_training.networks import BehaviorNetworks
+from cbe_training.networks import BehaviorNetworks, EncoderState
 
 CHUNK = 384  # frames convolved at once; more does not fit a small CPU's cache
 
@@ -81,6 +81,7 @@ class Policy:
         count, config = len(memory.embedding), networks.config
         self._device = memory.embedding.device
         self._encoder = torch.zeros(2, count, config.encoder_state, device=self._device)
+        self._pose = torch.zeros(count, 3, device=self._device)
         self._generator = torch.zeros(2, count, config.generator_state, device=self._device)
         self._previous: Tensor | None = None
         self._start = torch.zeros(count, config.relation, device=self._device)
@@ -105,9 +106,11 @@ class Policy:
         motion = nets.encoder.pair(features, features if first else self._previous[index])
         self._previous[index] = features
         self.seen = Seen(motion[:, None], attractor[:, None])
-        state = self._encoder[:, index]
-        embedding, (h, c) = nets.encoder(motion[:, None], (state[:1], state[1:]))
-        self._encoder[:, index] = torch.cat([h, c])
+        h, c = self._encoder[:, index].split(1)
+        before = None if first else EncoderState(h, c, self._pose[index])
+        embedding, after = nets.encoder(motion[:, None], before)
+        self._encoder[:, index] = torch.cat([after.h, after.c])
+        self._pose[index] = after.pose
         state = self._generator[:, index]
         out = nets.generator(
             nets.generator.relation(attractor, self._memory.goal[index])[:, None],

@@ -25,7 +25,7 @@ from cbe_training.networks import BehaviorNetworks
 from cbe_training.rollout import Behaviors, Rollouts, roll_out, show
 from cbe_training.team import Team
 
-GAPS = (1, 2, 2, 2, 3)  # steps between frames: mostly the runtime's, some slower and faster
+USUAL_GAP, OTHER_GAPS = 2, (1, 3)  # steps between frames: the runtime's, and slower and faster
 VALIDATION_WORLDS, VALIDATION_DRIVES = 10, 20
 VALIDATION_BEHAVIORS = 48
 SAVE_EVERY_S = 240.0
@@ -99,20 +99,28 @@ def iterate(
         return learn.means() | {"update_s": time.monotonic() - began}
     together = np.random.default_rng([config.seed, iteration])  # the same in every worker
     shortest, longest = config.frames(learner.sequences)
-    gap = int(together.choice(GAPS))
-    frames = int(together.integers(shortest, longest + 1))
     share = config.expert_share(learner.sequences)
-    began = time.monotonic()
-    behaviors = show(drives, config.demonstrations // team.size, frames, gap, rng)
     driver = learner.networks if share < 1.0 or what is Learn.BEHAVIORS else None
-    rollouts = roll_out(driver, drives, behaviors, config, rng, expert_share=share)
+    began = time.monotonic()
+    lessons: list[tuple[Behaviors, Rollouts, NDArray[np.intp]]] = []
+    collided, frames = [], []
+    # Gaps are mixed: from one gap alone a few updates already make every other look slow or fast.
+    for gap, part in ((USUAL_GAP, 2), (int(together.choice(OTHER_GAPS)), 1)):
+        count = config.demonstrations // team.size * part // 3
+        frames.append(int(together.integers(shortest, longest + 1)))
+        behaviors = show(drives, count, frames[-1], gap, rng)
+        rollouts = roll_out(driver, drives, behaviors, config, rng, expert_share=share)
+        collided.append(rollouts.collided.mean())
+        for _ in range(config.epochs):
+            for chosen in _minibatches(rollouts, config.minibatch // team.size, rng):
+                lessons.append((behaviors, rollouts, chosen))
     rolled = time.monotonic()
-    for _ in range(config.epochs):
-        for chosen in _minibatches(rollouts, config.minibatch // team.size, rng):
-            learn.behaviors(behaviors, rollouts, chosen, what)
+    for index in together.permutation(len(lessons)):
+        behaviors, rollouts, chosen = lessons[index]
+        learn.behaviors(behaviors, rollouts, chosen, what)
     row = learn.means()
-    row |= {"frames": behaviors.images.shape[1], "gap": gap, "expert_share": share}
-    row |= {"collided": float(rollouts.collided.mean())}
+    row |= {"frames": float(np.mean(frames)), "gap": gap, "expert_share": share}
+    row |= {"collided": float(np.mean(collided))}
     row |= {"rollout_s": rolled - began, "update_s": time.monotonic() - rolled}
     return row
 
@@ -151,24 +159,25 @@ class Updates:
             loss, parts = losses.compute(learner.networks, learner.heads, batch, config.loss)
         learner.sequences += len(chosen) * self._team.size
         if what is Learn.ALL:
-            seeing, also = self._relate(config.view_groups)
+            seeing, also = self._relate(1)
             loss, parts = loss + seeing, parts | also
         self._step(loss, parts)
 
     def views(self) -> None:
         """Learn from views alone."""
-        self._step(*self._relate(self._learner.config.view_groups_alone))
+        self._step(*self._relate(self._learner.config.views_alone))
 
     def means(self) -> dict[str, float]:
         """Mean of each loss and of the gradient's norm."""
         return {name: value / self._count for name, value in self._sums.items()}
 
-    def _relate(self, groups: int) -> tuple[Tensor, dict[str, float]]:
-        learner, rng = self._learner, self._rng
-        seen = views.draw(self._drives, groups // self._team.size, rng)
-        weights = learner.config.loss
+    def _relate(self, times: int) -> tuple[Tensor, dict[str, float]]:
+        learner, config, rng = self._learner, self._learner.config, self._rng
+        each = self._team.size
+        seen = views.draw(self._drives, times * config.view_groups // each, rng)
+        steps = views.draw_steps(self._drives, times * config.view_steps // each, rng)
         with self._arithmetic():
-            return losses.relate(learner.networks, learner.heads, seen, weights, rng)
+            return losses.relate(learner.networks, learner.heads, seen, steps, config.loss, rng)
 
     def _step(self, loss: Tensor, parts: dict[str, float]) -> None:
         learner, config = self._learner, self._learner.config

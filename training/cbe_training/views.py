@@ -1,7 +1,7 @@
-"""Groups of views of one place from nearby poses, for learning how views relate.
+"""Independent views for learning to see: groups of nearby ones, and pairs of frames.
 
-Related pose by pose, M views make M (M - 1) examples, and groups differ where a rollout's frames
-all look alike: attractors learn from them many times faster than from rollouts.
+Rollouts teach the convolutions little per frame, for their frames all look alike. Here every
+image is of another place, and M views of one make M (M - 1) examples.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,6 @@ AHEAD_STEPS = 40  # views lie up to 2 m further along the drive
 NOT_AHEAD = 0.4  # share of views at the group's first pose
 JITTER_M, JITTER_RAD = 0.3, 0.25
 MOST_JITTER = 1.6
-MOVING = 2  # views of a group that also have the frame before
 LONGEST_STEP_M = 0.15  # three steps at full speed
 CURVATURE_PER_M = 2.3  # the vehicle's tightest
 NOW, TARGET = np.nonzero(~np.eye(GROUP, dtype=np.bool_))  # all ordered pairs of a group
@@ -28,49 +27,65 @@ NOW, TARGET = np.nonzero(~np.eye(GROUP, dtype=np.bool_))  # all ordered pairs of
 
 @dataclass(frozen=True, slots=True)
 class Views:
-    """G groups of views."""
+    """G groups of views; `relation` holds the pose of view TARGET in the frame of view NOW."""
 
     images: NDArray[np.uint8]  # (G * GROUP, 64, 64, 3)
-    before: NDArray[np.uint8]  # (G * MOVING, 64, 64, 3) the frames before each group's first views
-    relation: NDArray[np.float64]  # (G, len(NOW), 3) pose of TARGET in the frame of NOW
-    motion: NDArray[np.float64]  # (G * MOVING, 3) pose of the view in the frame before
+    relation: NDArray[np.float64]  # (G, len(NOW), 3)
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """N pairs of frames; `motion` (N, 3) is the pose of `now` in the frame of `before`."""
+
+    before: NDArray[np.uint8]  # (N, 64, 64, 3)
+    now: NDArray[np.uint8]  # (N, 64, 64, 3)
+    motion: NDArray[np.float64]
 
 
 def draw(drives: Drives, count: int, rng: np.random.Generator) -> Views:
     """Draw `count` groups along random drives, off to the side as a repetition may be."""
-    chosen = rng.integers(0, len(drives.poses), count)
     ahead = rng.integers(0, AHEAD_STEPS + 1, (count, GROUP))
     ahead = np.where(rng.random((count, GROUP)) < NOT_AHEAD, 0, ahead)
-    poses = np.zeros((count, GROUP, 3))
-    for row, drive in enumerate(chosen):
-        path = drives.poses[drive]
-        poses[row] = path[np.minimum(rng.integers(0, len(path)) + ahead[row], len(path) - 1)]
-    group = np.repeat(np.arange(count), GROUP)
-    world = drives.world[chosen][group]
-    flat = _jitter(drives, world, poses.reshape(-1, 3), rng)
+    world, flat = _stand(drives, ahead, rng)
+    cameras = appearance.sample(rng, count, Robot().camera_height_m)
+    cameras = appearance.vary(rng, cameras.take(np.repeat(np.arange(count), GROUP)))
+    images = photograph(drives, world, flat, cameras, _supersample(rng), rng)
     poses = flat.reshape(count, GROUP, 3)
-    moving = np.flatnonzero(np.tile(np.arange(GROUP) < MOVING, count))
-    back = _back(len(moving), rng)
-    everything = np.concatenate([flat, geometry.compose(flat[moving], back)])
-    rows = np.concatenate([np.arange(len(flat)), moving])
-    cameras = appearance.sample(rng, count, Robot().camera_height_m).take(group)
-    cameras = appearance.vary(rng, cameras).take(rows)
-    supersample = 1 if rng.random() < ALIASED else 2
-    images = photograph(drives, world[rows], everything, cameras, supersample, rng)
-    return Views(
-        images[: len(flat)],
-        images[len(flat) :],
-        geometry.relative(poses[:, NOW], poses[:, TARGET]),
-        geometry.relative(everything[len(flat) :], flat[moving]),
-    )
+    return Views(images, geometry.relative(poses[:, NOW], poses[:, TARGET]))
 
 
-def _back(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Poses (N, 3) a short arc behind."""
+def draw_steps(drives: Drives, count: int, rng: np.random.Generator) -> Steps:
+    """Draw `count` short arcs along random drives."""
+    world, now = _stand(drives, np.zeros((count, 1), np.int64), rng)
     length = rng.uniform(0.0, LONGEST_STEP_M, count)
     turned = length * rng.uniform(-CURVATURE_PER_M, CURVATURE_PER_M, count)
     half = turned / 2.0  # so short an arc is its chord
-    return np.stack([-length * np.cos(half), length * np.sin(half), -turned], axis=1)
+    back = np.stack([-length * np.cos(half), length * np.sin(half), -turned], axis=1)
+    before = geometry.compose(now, back)
+    cameras = appearance.sample(rng, count, Robot().camera_height_m)
+    cameras, supersample = appearance.vary(rng, cameras), _supersample(rng)
+    first, second = (
+        photograph(drives, world, poses, cameras, supersample, rng) for poses in (before, now)
+    )
+    return Steps(first, second, geometry.relative(before, now))
+
+
+def _supersample(rng: np.random.Generator) -> int:
+    return 1 if rng.random() < ALIASED else 2
+
+
+def _stand(
+    drives: Drives, ahead: NDArray[np.int64], rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Worlds (G * M,) and poses (G * M, 3), `ahead` (G, M) steps on from G places on drives."""
+    count, each = ahead.shape
+    chosen = rng.integers(0, len(drives.poses), size=(count,))
+    poses = np.zeros((count, each, 3))
+    for row, drive in enumerate(chosen):
+        path = drives.poses[drive]
+        poses[row] = path[np.minimum(rng.integers(0, len(path)) + ahead[row], len(path) - 1)]
+    world = np.repeat(drives.world[chosen], each)
+    return world, _jitter(drives, world, poses.reshape(-1, 3), rng)
 
 
 def _jitter(
