@@ -45,7 +45,7 @@ class TrainConfig:
     clip_norm: float = 1.0
     average_decay: float = 0.998  # of the exported moving average of the weights
     view_groups: int = 8  # groups of views in one update
-    view_steps: int = 96  # pairs of frames in one update
+    view_steps: int = 48  # pairs of frames in one update
     views_alone: int = 3  # times as many where only views are learnt from
     view_updates: int = 48  # in one such iteration
     cloning_sequences: int = 21_000  # expert at the wheel, short behaviors
