@@ -1,4 +1,6 @@
-"""Names, shapes and types of the three ONNX graphs and of their metadata.
+"""Names, shapes and types of the ONNX graphs and of their metadata.
+
+Three drive; `shape` is for people and may be missing.
 
 The one place that names them: the exporter writes to it and the runtime refuses what differs.
 Batch 1, one tick, every recurrent state explicit (paper, Sec. III-B to III-D).
@@ -10,8 +12,11 @@ CONTRACT_VERSION = 1
 
 IMAGE_SIZE = 64
 FEATURES = (32, 16, 16)
+ATTRACTOR_SHAPE = (8, 5, 10)  # channels, rows, columns; turning the robot shifts the columns
 ATTRACTOR_SIZE = 400
 EMBEDDING_SIZE = 32
+OVERRUN_M = 0.3  # a waypoint runs on so far, straight, past a behavior's end
+SHAPE_POINTS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +94,19 @@ def generator(state_size: int) -> Graph:
             Tensor("h_next", state),
             Tensor("c_next", state),
         ),
+    )
+
+
+def shape() -> Graph:
+    """Path read off an embedding: points x, y in m at equal shares of a behavior's time.
+
+    In the frame of its first pose, the last point being its end. Auxiliary: a model folder
+    without it still drives.
+    """
+    return Graph(
+        "shape",
+        (Tensor("embedding", (1, EMBEDDING_SIZE)),),
+        (Tensor("path_m", (1, SHAPE_POINTS, 2)),),
     )
 
 

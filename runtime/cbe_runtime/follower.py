@@ -11,6 +11,7 @@ import numpy as np
 from cbe.controller import Motion, RmpController, twist
 from cbe.errors import ModelError
 from cbe.robot import STEP_S, Robot
+from cbe.signature import OVERRUN_M
 from cbe.stop_zone import limit
 from cbe_runtime.behavior import Behavior
 from cbe_runtime.observation import Observation, StampWatch, usable_image, usable_ranges
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from cbe_runtime.route import Route
 
 ARRIVED_RANGE_M = 0.03
-"""Nearer than this the last waypoint counts as reached: below the stopping jerk of one step."""
+"""Nearer than this the end counts as reached: below the stopping jerk of one step."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +36,7 @@ class FollowerConfig:
     switch_progress: float = 0.95  # phi >= 0.95 starts the next behavior, Sec. III-D
     arrival_progress: float = 0.95  # the same on the last behavior means ARRIVED
     resting_progress: float = 0.85  # enough where the waypoint says that the end is here:
-    resting_range_m: float = 0.12  # a progress that stalls below the threshold must not strand it
-    final_range_m: float = 0.4  # a waypoint nearer than this is the end of the behavior:
-    final_bearing_rad: float = 0.15  # come in straight, a little beside it rather than turned
+    resting_range_m: float = 0.05  # a progress that stalls below the threshold must not strand it
     progress_ticks: int = 2  # network ticks in a row that must agree, against flicker
     timeout_factor: float = 3.0  # a segment may take this many times the demonstration's steps
     timeout_steps: int = 100  # ... and this many more
@@ -192,8 +191,8 @@ class Follower:
         """Start the next behavior, or arrive, once enough ticks in a row say so."""
         last, config = self._behavior.last, self._config
         done = prediction.progress >= (config.arrival_progress if last else config.switch_progress)
-        if self._ending():
-            done |= prediction.waypoint_m[0] < config.resting_range_m
+        if prediction.progress >= config.resting_progress:
+            done |= math.hypot(*prediction.waypoint_m) < OVERRUN_M + config.resting_range_m
         self._done_ticks = self._done_ticks + 1 if done else 0
         if self._done_ticks < config.progress_ticks:
             return
@@ -229,7 +228,7 @@ class Follower:
             self._command = (0.0, 0.0)
         else:
             scan_m = ranges_m[None]  # (1, rays)
-            goal_m = np.array([self._aim()])  # (1, 2)
+            goal_m = np.array([self._waypoint_m])  # (1, 2)
             motion = self._controller.step(self._motion, goal_m, scan_m)
             if state is State.ARRIVED:
                 motion = self._coast(motion)
@@ -237,26 +236,10 @@ class Follower:
             speed, yaw_rate = twist(self._motion, self._robot)
             self._command = (float(speed[0]), float(yaw_rate[0]))
 
-    def _ending(self) -> bool:
-        """Whether the waypoint is the end of the behavior."""
-        assert self._prediction is not None
-        assert self._waypoint_m is not None
-        near = math.hypot(*self._waypoint_m) < self._config.final_range_m
-        return near and self._prediction.progress >= self._config.resting_progress
-
-    def _aim(self) -> tuple[float, float]:
-        """Where to drive to: the waypoint, but no sharp turn for its last decimetres."""
-        assert self._waypoint_m is not None
-        x, y = self._waypoint_m
-        if not self._ending():
-            return x, y
-        most = max(x, 0.0) * math.tan(self._config.final_bearing_rad)
-        return x, min(max(y, -most), most)
-
     def _coast(self, motion: Motion) -> Motion:
-        """Come to rest at the last waypoint: never faster than before, nor than can be braked."""
+        """Come to rest at the end: never faster than before, nor than can be braked."""
         assert self._waypoint_m is not None
-        ahead_m = self._waypoint_m[0] - ARRIVED_RANGE_M
+        ahead_m = self._waypoint_m[0] - OVERRUN_M - ARRIVED_RANGE_M
         cap = math.sqrt(2.0 * self._robot.max_braking_mps2 * ahead_m) if ahead_m > 0.0 else 0.0
         speed = np.minimum(motion.speed_mps, np.minimum(self._motion.speed_mps, cap))
         return Motion(speed, motion.steer_rad)

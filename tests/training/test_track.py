@@ -3,6 +3,7 @@
 import numpy as np
 
 from cbe import geometry
+from cbe.signature import OVERRUN_M
 from cbe_training import track
 
 STRAIGHT = np.stack([np.arange(41) * 0.05, np.zeros(41), np.zeros(41)], axis=-1)
@@ -20,9 +21,12 @@ def test_waypoint_lies_ahead_on_the_path_in_the_robots_frame() -> None:
     np.testing.assert_allclose(labels.waypoint_m[0], [-0.2, -0.6], atol=1e-9)
 
 
-def test_waypoint_is_shortened_to_the_paths_end() -> None:
-    labels = _label([1.9, 0.0, 0.0], 38)
-    np.testing.assert_allclose(labels.waypoint_m[0], [0.1, 0.0], atol=1e-9)
+def test_waypoint_runs_on_straight_for_a_little_past_the_paths_end() -> None:
+    turned = geometry.compose(np.array([0.0, 0.0, 0.7]), STRAIGHT)
+    for x_m, expected_m in ((1.6, 0.6), (1.9, 0.1 + OVERRUN_M), (2.1, OVERRUN_M - 0.1)):
+        pose = geometry.compose(np.array([0.0, 0.0, 0.7]), np.array([x_m, 0.0, 0.0]))
+        labels = _label(list(pose), 36, turned)
+        np.testing.assert_allclose(labels.waypoint_m[0], [expected_m, 0.0], atol=1e-9)
 
 
 def test_progress_is_the_share_of_arc_length() -> None:

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from cbe import geometry
+from cbe import geometry, signature
 
 SEARCH_BACK, SEARCH_AHEAD = 6, 20  # samples round the last closest one: self-crossing drives
 
@@ -60,14 +60,14 @@ def label(
 ) -> Labels:
     """Labels at world poses (B, 3), searched near the samples `last` (B,)."""
     closest, distance, target = _closest(
-        paths.poses, paths.arc_m, paths.length, poses, last, lookahead_m
+        paths.poses, paths.arc_m, paths.length, poses, last, lookahead_m, signature.OVERRUN_M
     )
     progress = paths.arc_m[np.arange(len(closest)), closest] / np.maximum(paths.total_m, 1e-6)
     return Labels(closest, distance, progress, geometry.to_frame(poses, target))
 
 
 @numba.njit(cache=True)
-def _closest(path, arc, length, poses, last, lookahead):  # type: ignore[no-untyped-def]
+def _closest(path, arc, length, poses, last, lookahead, overrun):  # type: ignore[no-untyped-def]
     count = len(poses)
     closest = np.empty(count, np.int64)
     distance = np.empty(count)
@@ -91,4 +91,8 @@ def _closest(path, arc, length, poses, last, lookahead):  # type: ignore[no-unty
             share = (wanted - arc[b, i - 1]) / (arc[b, i] - arc[b, i - 1])
             for k in range(2):
                 target[b, k] = path[b, i - 1, k] + share * (path[b, i, k] - path[b, i - 1, k])
+        elif arc[b, i] < wanted:  # the path runs on straight, so that the robot arrives aligned
+            beyond = min(wanted - arc[b, i], overrun)
+            target[b, 0] += beyond * np.cos(path[b, i, 2])
+            target[b, 1] += beyond * np.sin(path[b, i, 2])
     return closest, distance, target
