@@ -134,8 +134,8 @@ class Witness:
 
     def _heard(self, fields: dict[str, Any]) -> None:
         with self._lock:
-            stamp_ns = self._truths[-1].stamp_ns if self._truths else 0
-            self._statuses.append(Status.read(fields, stamp_ns))
+            if self._truths:  # what is said before has no place in time
+                self._statuses.append(Status.read(fields, self._truths[-1].stamp_ns))
 
 
 def along(

@@ -1,4 +1,6 @@
 import math
+import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ from cbe.errors import WorldError
 from cbe_bench import demo_course
 from cbe_bench.demo_processes import Crew, OverdueError
 from cbe_bench.demo_report import ARRIVED, Drive, Repetition, Report
-from cbe_bench.demo_witness import Truth, along
+from cbe_bench.demo_witness import Truth, Witness, along
 from cbe_hil_sim.generate import TEST_SEEDS, generate
 
 SEEDS = (1, 2, 3)
@@ -99,3 +101,47 @@ def test_crew_leaves_no_process_behind_on_an_error(tmp_path):
         child.wait(0.2)
 
     assert child.returncode is not None
+
+
+class FakeInbox:
+    """Hands out one message at a time, as `cbe.inbox.Latest` does."""
+
+    def __init__(self):
+        self._messages = []
+        self._taken = 0
+
+    def put(self, message):
+        self._messages.append(message)
+        while self._taken < len(self._messages):
+            time.sleep(0.001)
+
+    def wait(self, after, timeout_s):
+        self._taken = after  # whoever asks for the next has dealt with the last
+        if len(self._messages) <= after:
+            time.sleep(0.001)
+            return None
+        return SimpleNamespace(message=self._messages[after], count=after + 1)
+
+
+def test_status_heard_before_any_truth_has_no_place_in_time():
+    inboxes = {"truth": FakeInbox(), "status": FakeInbox()}
+    status = {
+        "state": "FOLLOWING",
+        "reason": None,
+        "segment": 0,
+        "progress": 0.0,
+        "tick_ms": {},
+        "camera_to_command_ms": {},
+    }
+    truth = {
+        "stamp_ns": 50_000_000_000,
+        "pose": [0.0, 0.0, 0.0],
+        "speed_mps": 0.0,
+        "clearance_m": None,
+        "collided": False,
+    }
+    with Witness(SimpleNamespace(latest_json=inboxes.__getitem__)) as witness:
+        inboxes["status"].put(status)
+        inboxes["truth"].put(truth)
+        inboxes["status"].put(status)
+        assert [heard.stamp_ns for heard in witness.statuses] == [50_000_000_000]
