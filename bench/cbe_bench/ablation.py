@@ -5,16 +5,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from cbe_bench.evaluation import RunConfig
 from cbe_bench.memory import Memory
-from cbe_bench.single import SingleConfig, run
+from cbe_bench.single import run
 from cbe_bench.tally import compare
 from cbe_runtime.networks import Networks
 
 CLONED = "without DAgger"
+PARTS = (Memory.FULL, Memory.NO_ATTRACTORS, Memory.NO_EMBEDDING)  # a single behavior has no joint
 _PAIRED = ("pairs", "difference")
 
 
-def ablate(config: SingleConfig, cloned: Path | None = None) -> dict[str, Any]:
+def ablate(config: RunConfig, cloned: Path | None = None) -> dict[str, Any]:
     """Drive the same episodes with the whole memory and with a part of it missing.
 
     Args:
@@ -29,7 +31,7 @@ def ablate(config: SingleConfig, cloned: Path | None = None) -> dict[str, Any]:
     Raises:
         CbeError: a model, the world or an option cannot be used.
     """
-    variants = {memory.value: replace(config, memory=memory) for memory in Memory}
+    variants = {memory.value: replace(config, memory=memory) for memory in PARTS}
     if cloned is not None:
         Networks.load(cloned)  # refused now rather than after all the others
         variants[CLONED] = replace(config, model=cloned)

@@ -4,10 +4,16 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cbe.errors import CbeError, ConfigError
+from cbe_bench import options as shared
+from cbe_runtime.route import AttractorPrecision
+
+if TYPE_CHECKING:
+    from cbe_bench.evaluation import Evaluation
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -31,41 +37,68 @@ def _parser() -> argparse.ArgumentParser:
 
     single = commands.add_parser("single", help="repeat single behaviors in many worlds")
     single.add_argument("--steps", type=int, default=128, help="length, 0.1 s each (%(default)s)")
-    _add_run_options(single)
+    shared.add_behaviors(single)
     single.add_argument("--plot", type=Path, metavar="FILE", help="write a sheet of traces")
     single.set_defaults(run=_single)
 
     sweep = commands.add_parser("sweep", help="success against length")
     sweep.add_argument(
-        "--steps", type=_integers, default=None, metavar="N,N,...", help="lengths in steps of 0.1 s"
+        "--steps", type=shared.integers, metavar="N,N,...", help="lengths in steps of 0.1 s"
     )
-    _add_run_options(sweep)
+    shared.add_behaviors(sweep)
     sweep.add_argument("--plot", type=Path, metavar="FILE", help="write the curve")
     sweep.set_defaults(run=_sweep)
 
     ablation = commands.add_parser("ablation", help="what each part of the memory is worth")
     ablation.add_argument("--steps", type=int, default=128, help="length, 0.1 s each (%(default)s)")
-    _add_run_options(ablation)
+    shared.add_behaviors(ablation)
     ablation.add_argument(
         "--cloned", type=Path, metavar="DIR", help="also run this model, trained without DAgger"
     )
     ablation.set_defaults(run=_ablation)
+
+    route = commands.add_parser("route", help="repeat long drives from room to room")
+    shared.add_journeys(route)
+    route.add_argument(
+        "--segment-steps", type=int, metavar="K", help="longest segment (the model's own)"
+    )
+    route.add_argument(
+        "--precision", type=AttractorPrecision, choices=list(AttractorPrecision),
+        default=AttractorPrecision.U8, metavar="f32|u8|u4",
+        help="of attractors; with f32 embeddings are f32 too, else f16 (%(default)s)",
+    )  # fmt: skip
+    route.add_argument(
+        "--no-relocation", action="store_true", help="hide the joints' attractors from the robot"
+    )
+    route.add_argument("--plot", type=Path, metavar="FILE", help="write a sheet of traces")
+    route.set_defaults(run=_route)
+
+    compression = commands.add_parser("compression", help="success against memory, as the paper's")
+    shared.add_journeys(compression)
+    compression.add_argument(
+        "--segment-steps", type=shared.integers, metavar="K,K,...", help="longest segments"
+    )
+    compression.add_argument(
+        "--precision", type=shared.precisions, default=list(AttractorPrecision),
+        metavar="P,P,...", help="of attractors: f32, u8, u4 (all three)",
+    )  # fmt: skip
+    compression.add_argument("--plot", type=Path, metavar="FILE", help="write the figure")
+    compression.set_defaults(run=_compression)
 
     manifold = commands.add_parser("manifold", help="map the embeddings of many demonstrations")
     manifold.add_argument("--steps", type=int, default=100, help="length, 0.1 s each (%(default)s)")
     manifold.add_argument("--episodes", type=int, default=1000, help="how many (%(default)s)")
     manifold.add_argument("--seed", type=int, default=0, help="of worlds, drives and map")
     manifold.add_argument("--world", choices=("val", "test"), default="test")
-    manifold.add_argument("--model", type=Path, metavar="DIR", help="folder of ONNX files")
-    manifold.add_argument("--jobs", type=int, default=0, metavar="N", help="processes (one a core)")
+    shared.add_model(manifold)
     manifold.add_argument("--plot", type=Path, metavar="FILE", help="write the map")
-    manifold.add_argument("--json", type=Path, metavar="FILE", help="write the result")
+    shared.add_output(manifold)
     manifold.set_defaults(run=_manifold)
 
     compare = commands.add_parser("compare", help="compare two results episode by episode")
-    compare.add_argument("a", type=Path, help="JSON of cbe-bench single")
-    compare.add_argument("b", type=Path, help="JSON of cbe-bench single")
-    compare.add_argument("--json", type=Path, metavar="FILE", help="write the result")
+    for name in ("a", "b"):
+        compare.add_argument(name, type=Path, help="JSON of cbe-bench single or route")
+    shared.add_output(compare)
     compare.set_defaults(run=_compare)
 
     speed = commands.add_parser("speed", help="time renderer, controller and networks")
@@ -75,85 +108,57 @@ def _parser() -> argparse.ArgumentParser:
         "--paced-seconds", type=float, default=30.0, metavar="S",
         help="how long to pace at 10 Hz, 0 for not at all (%(default)s)",
     )  # fmt: skip
-    speed.add_argument("--json", type=Path, metavar="FILE", help="write the result")
+    shared.add_output(speed)
     speed.set_defaults(run=_speed)
     return parser
 
 
-def _add_run_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--episodes", type=int, default=500, help="how many (%(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of worlds, drives, starts and noise")
-    parser.add_argument(
-        "--world", default="test", metavar="val|test|SCENE_DIR|PGM_YAML",
-        help="generated worlds of a split, a mesh scene or a floor plan (%(default)s)",
-    )  # fmt: skip
-    jitter = parser.add_mutually_exclusive_group()
-    jitter.add_argument(
-        "--jitter-scale", type=float, default=1.0, help="times the paper's jitter (%(default)s)"
-    )
-    jitter.add_argument(
-        "--no-jitter", action="store_const", const=0.0, dest="jitter_scale",
-        help="start at the demonstration's first pose",
-    )  # fmt: skip
-    parser.add_argument("--world-seeds", type=_range, metavar="A:B", help="worlds A to B-1 only")
-    parser.add_argument("--backend", choices=("column", "bullet"), default="column")
-    parser.add_argument(
-        "--noise", type=float, default=0.0, metavar="S", help="actuation noise, the paper's s"
-    )
-    parser.add_argument(
-        "--obstacle-offset", type=float, metavar="M", help="put a bin so far beside the path"
-    )
-    parser.add_argument("--model", type=Path, metavar="DIR", help="folder of ONNX files")
-    parser.add_argument("--jobs", type=int, default=0, metavar="N", help="processes (one a core)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the result")
-
-
-def _config(options: argparse.Namespace, steps: int) -> Any:
-    from cbe_bench.scenario import Terms
-    from cbe_bench.single import SingleConfig
-
-    terms = Terms(
-        world=options.world,
-        steps=steps,
-        seed=options.seed,
-        jitter_scale=options.jitter_scale,
-        obstacle_offset_m=options.obstacle_offset,
-    )
-    return SingleConfig(
-        terms,
-        episodes=options.episodes,
-        world_seeds=options.world_seeds,
-        backend=options.backend,
-        noise=options.noise,
-        model=_model(options),
-        jobs=options.jobs,
-    )
-
-
-def _model(options: argparse.Namespace) -> Path:
-    from cbe_runtime.networks import PACKAGED_MODELS
-
-    return options.model or PACKAGED_MODELS
-
-
 def _single(options: argparse.Namespace) -> None:
-    from cbe_bench import sheet, single
+    from cbe_bench import single
 
-    done = single.run(_config(options, options.steps))
+    _report(options, single.run(shared.behaviors(options, options.steps)), f"{options.steps} steps")
+
+
+def _route(options: argparse.Namespace) -> None:
+    from cbe_bench import route
+    from cbe_bench.memory import Memory
+
+    journeys = shared.journeys(options)
+    if options.no_relocation:
+        journeys = replace(journeys, memory=Memory.NO_RELOCATION)
+    precision = route.precision_of(options.precision)
+    done = route.run(route.RouteConfig(journeys, options.segment_steps, precision))
+    _report(options, done, f"{options.length_m:g} m")
+
+
+def _report(options: argparse.Namespace, done: "Evaluation", what: str) -> None:
+    from cbe_bench import sheet
+
     result = done.summary
-    brief = {key: value for key, value in result.items() if key != "runs"}
     _write(options.json, result)
-    _say(json.dumps(brief, indent=2))
+    _say(json.dumps({key: value for key, value in result.items() if key != "runs"}, indent=2))
     if options.plot:
-        title = f"{options.steps} steps, {options.world}: success {result['success']:.3f}"
+        title = f"{what}, {options.world}: success {result['success']:.3f}"
         sheet.draw(done.traces, options.world, options.plot, title)
+
+
+def _compression(options: argparse.Namespace) -> None:
+    from cbe_bench import compression
+    from cbe_bench.route import RouteConfig
+
+    lengths = options.segment_steps or compression.SEGMENT_STEPS
+    result = compression.measure(RouteConfig(shared.journeys(options)), lengths, options.precision)
+    _write(options.json, result)
+    _say(compression.table(result))
+    if options.plot:
+        compression.draw(result, options.plot)
 
 
 def _sweep(options: argparse.Namespace) -> None:
     from cbe_bench import sweep
 
     steps = options.steps or sweep.STEPS
-    result = sweep.sweep(_config(options, max(steps)), steps)
+    result = sweep.sweep(shared.behaviors(options, max(steps)), steps)
     _write(options.json, result)
     for row in result["lengths"]:
         low, high = row["ci95"]
@@ -168,7 +173,7 @@ def _sweep(options: argparse.Namespace) -> None:
 def _ablation(options: argparse.Namespace) -> None:
     from cbe_bench import ablation
 
-    result = ablation.ablate(_config(options, options.steps), options.cloned)
+    result = ablation.ablate(shared.behaviors(options, options.steps), options.cloned)
     _write(options.json, result)
     _say(ablation.table(result))
 
@@ -177,7 +182,12 @@ def _manifold(options: argparse.Namespace) -> None:
     from cbe_bench import manifold
 
     config = manifold.ManifoldConfig(
-        options.world, options.steps, options.episodes, options.seed, _model(options), options.jobs
+        options.world,
+        options.steps,
+        options.episodes,
+        options.seed,
+        shared.model(options),
+        options.jobs,
     )
     result = manifold.measure(config, options.plot)
     _write(options.json, result)
@@ -200,19 +210,12 @@ def _compare(options: argparse.Namespace) -> None:
 def _speed(options: argparse.Namespace) -> None:
     from cbe_bench.speed import SpeedConfig, measure
 
-    config = SpeedConfig(_model(options), blocks=options.blocks, paced_s=options.paced_seconds)
+    config = SpeedConfig(
+        shared.model(options), blocks=options.blocks, paced_s=options.paced_seconds
+    )
     result = measure(config, lambda what: _note(f"measuring {what} ..."))
     _write(options.json, result)
     _say(json.dumps(result, indent=2))
-
-
-def _integers(text: str) -> list[int]:
-    return [int(part) for part in text.split(",")]
-
-
-def _range(text: str) -> range:
-    first, _, end = text.partition(":")
-    return range(int(first), int(end))
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -221,7 +224,7 @@ def _read(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise ConfigError(f"cannot read {path}: {error}") from error
     if not isinstance(value, dict):
-        raise ConfigError(f"{path} is no result of cbe-bench single")
+        raise ConfigError(f"{path} is no result of cbe-bench")
     return value
 
 

@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 
 from cbe import geometry
 from cbe.errors import ConfigError, ModelError
+from cbe_bench.drives import Pieces
 from cbe_bench.episode import film
+from cbe_bench.evaluation import use_one_thread
 from cbe_bench.place import GENERATED, Place, world_seeds
 from cbe_bench.scenario import GROUP, Terms, scenarios
-from cbe_bench.single import teach, use_one_thread
+from cbe_bench.single import teach
 from cbe_runtime.networks import PACKAGED_MODELS, Networks
 
 FEWEST = 40  # 33 numbers are fitted, and a t-SNE needs neighbours
@@ -54,7 +56,7 @@ class ManifoldConfig:
     @property
     def terms(self) -> Terms:
         """What is asked of the drives: they are only looked at, so nothing stands beside them."""
-        return Terms(self.world, self.steps, self.seed, jitter_scale=0.0)
+        return Terms(self.world, Pieces(self.steps), self.seed, jitter_scale=0.0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,15 +15,20 @@ class Memory(StrEnum):
     FULL = "full memory"
     NO_ATTRACTORS = "without attractors"
     NO_EMBEDDING = "without embedding"
+    NO_RELOCATION = "without relocation"
 
     def of(self, route: Route) -> Route:
         """The route with what is missing set to all zeros, which training taught to mean absent.
 
         Every precision stores zeros exactly.
         """
-        if self is Memory.NO_ATTRACTORS:
+        if self in {Memory.NO_ATTRACTORS, Memory.NO_RELOCATION}:
             none = route.precision.attractor.pack(np.zeros(ATTRACTOR_SIZE, np.float32))
-            return replace(route, attractors=(none,) * len(route.attractors))
+            kept = list(route.attractors)
+            # The ends are no joints: without relocation the robot still knows start and goal.
+            missing = slice(None) if self is Memory.NO_ATTRACTORS else slice(1, -1)
+            kept[missing] = [none] * len(kept[missing])
+            return replace(route, attractors=tuple(kept))
         if self is Memory.NO_EMBEDDING:
             none = route.precision.embedding.pack(np.zeros(EMBEDDING_SIZE, np.float32))
             return replace(

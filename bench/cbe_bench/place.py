@@ -101,23 +101,26 @@ class Place:
 
     @contextmanager
     def backend(
-        self, *, noise: float = 0.0, rng: np.random.Generator | None = None, bin_: Bin | None = None
+        self,
+        *,
+        noise: float = 0.0,
+        rng: np.random.Generator | None = None,
+        bins: Sequence[Bin] = (),
     ) -> Iterator[tuple[Backend, See]]:
         """One robot's backend, with what turns its images into the networks' view.
 
         `noise` and `rng` as in `Vehicle`; pybullet's car, which slips by itself, takes none.
         """
         if self._kind == "column":
-            world = self.world if bin_ is None else bin_.in_world(self.world)
-            batch = self.batch if bin_ is None else None
+            world, batch = _with_bins(self.world, bins), None if bins else self.batch
             nowhere_else = np.zeros(1, np.int64)
             yield ColumnBackend([world], nowhere_else, batch=batch, noise=noise, rng=rng), _as_it_is
-        elif bin_ is None:
+        elif not bins:
             if self._bullet is None:
-                self._bullet = self._load_bullet(None)
+                self._bullet = self._load_bullet(())
             yield self._bullet, Preprocessor(self._bullet.camera)
         else:
-            with self._load_bullet(bin_) as bullet:
+            with self._load_bullet(bins) as bullet:
                 yield bullet, Preprocessor(bullet.camera)
 
     def close(self) -> None:
@@ -126,14 +129,13 @@ class Place:
             self._bullet.close()
             self._bullet = None
 
-    def _load_bullet(self, bin_: Bin | None) -> "BulletBackend":
+    def _load_bullet(self, bins: Sequence[Bin]) -> "BulletBackend":
         from cbe_hil_sim.bullet import BulletBackend
         from cbe_hil_sim.bulletscene import scene_from_world
 
         if self._scene is None:
-            world = self.world if bin_ is None else bin_.in_world(self.world)
-            return BulletBackend(scene_from_world(world))
-        return BulletBackend(self._scene if bin_ is None else _with_bin(self._scene, bin_))
+            return BulletBackend(scene_from_world(_with_bins(self.world, bins)))
+        return BulletBackend(functools.reduce(_stand_in, bins, self._scene))
 
 
 @functools.lru_cache(maxsize=1)
@@ -151,7 +153,13 @@ def _load_plan(path: Path) -> World:
     return from_floorplan(path)
 
 
-def _with_bin(scene: "Scene", bin_: Bin) -> "Scene":
+def _with_bins(world: World, bins: Sequence[Bin]) -> World:
+    for bin_ in bins:
+        world = bin_.in_world(world)
+    return world
+
+
+def _stand_in(scene: "Scene", bin_: Bin) -> "Scene":
     """The scene with a plain bin standing in it."""
     from cbe_hil_sim.scene import Patch
 

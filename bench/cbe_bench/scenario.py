@@ -1,4 +1,4 @@
-"""What an episode asks for: a demonstrated drive, a start beside its own and perhaps a bin."""
+"""What an episode asks for: a demonstrated drive, a start beside its own and perhaps bins."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cbe.errors import WorldError
-from cbe.robot import STEP_S, Robot
+from cbe.robot import Robot
+from cbe_bench.drives import Drives
 from cbe_bench.place import Bin, Place
-from cbe_hil_sim.astar import SPACING_M, GoalField
-from cbe_hil_sim.demonstrator import ENDPOINT_CLEARANCE_M, demonstrate, sample_routes
+from cbe_hil_sim.demonstrator import demonstrate
 from cbe_hil_sim.world import World
 
 GROUP = 10
@@ -23,32 +23,31 @@ START_CLEARANCE_M = 0.08  # from the body's surface: the car cannot back out of 
 SIGHT_CLEARANCE_M = 0.05  # along the line to the demonstration's start
 BIN_MARGIN_SAMPLES = 10
 BIN_PASSAGE_M = 0.6
-_LEAD_M, _TAIL_M = 1.5, 6.0  # a route is longer than the drive by something between
+BIN_APART_M = 1.5  # from bin to bin, so that the car gets past one side and then the other
 _ROUNDS, _WORLDS, _TRIES = 6, 4, 100
-_LEG_POINTS, _LEG_SHARE, _LEG_TRIES = 20, 0.7, 8
-_SHARPEST_RAD = math.radians(150.0)  # turn from leg to leg; what the car cannot drive, fails
 
 
 @dataclass(frozen=True, slots=True)
 class Terms:
-    """What all episodes of a run have in common; lengths in steps of 0.1 s."""
+    """What all episodes of a run have in common."""
 
     world: str
-    steps: int
+    drives: Drives
     seed: int
     jitter_scale: float = 1.0  # 0 starts at the demonstration's own pose
-    obstacle_offset_m: float | None = None
+    obstacles: int = 0  # bins, each so far beside the path:
+    obstacle_offset_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """One episode before it is driven: `demonstration` (steps + 1, 3) and `start` (3,) poses."""
+    """One episode before it is driven: `demonstration` (T, 3) one a step, and `start` (3,) pose."""
 
     index: int
     world_seed: int
     demonstration: NDArray[np.float64]
     start: NDArray[np.float64]
-    bin_: Bin | None
+    bins: tuple[Bin, ...]
 
     @property
     def length_m(self) -> float:
@@ -83,8 +82,8 @@ def scenarios(
     missing = [index for index in indices[:count] if index not in found]
     if missing:
         raise WorldError(
-            f"no drive of {terms.steps} steps found for episodes {missing} in {terms.world} "
-            f"(world seeds {tried}); ask for fewer steps or a larger world"
+            f"no drive of {terms.drives} found for episodes {missing} in {terms.world} "
+            f"(world seeds {tried}); ask for a shorter one or a larger world"
         )
     return [found[index] for index in indices[:count]]
 
@@ -97,41 +96,39 @@ def _in_place(
     found: dict[int, Scenario] = {}
     for _ in range(_ROUNDS):
         missing = [index for index in streams if index not in found]
-        routes = {index: _route(terms, world, streams[index]) for index in missing}
-        asked = {index: path for index, path in routes.items() if path is not None}
+        paths = {index: terms.drives.path(world, streams[index]) for index in missing}
+        asked = {index: path for index, path in paths.items() if path is not None}
         if not asked:
             break
         where = np.zeros(len(asked), np.int64)
         for drive in demonstrate(place.batch, [world], where, list(asked.values()), robot):
             index = list(asked)[drive.route]
             rng = streams[index]
-            spare = len(drive.poses) - (terms.steps + 1)
-            if spare < 0:
+            part = terms.drives.part(drive.poses, rng)
+            if part is None:
                 continue
-            first = int(rng.integers(0, spare + 1))
-            piece = drive.poses[first : first + terms.steps + 1]
-            fitted = _fit(terms, world, piece, rng)
+            fitted = _fit(terms, world, part, rng)
             if fitted is not None:
-                found[index] = Scenario(index, world_seed, piece, *fitted)
+                found[index] = Scenario(index, world_seed, part, *fitted)
         if len(found) == len(streams):
             break
     return found
 
 
 def _fit(
-    terms: Terms, world: World, piece: NDArray[np.float64], rng: np.random.Generator
-) -> tuple[NDArray[np.float64], Bin | None] | None:
-    """A start and a bin that suit a demonstration, or None."""
-    # Streams of their own: with and without a bin the start is drawn alike.
-    for_start, for_bin = rng.spawn(2)
-    bin_ = None
-    if terms.obstacle_offset_m is not None:
-        bin_ = _place_bin(world, piece, terms.obstacle_offset_m, for_bin)
+    terms: Terms, world: World, drive: NDArray[np.float64], rng: np.random.Generator
+) -> tuple[NDArray[np.float64], tuple[Bin, ...]] | None:
+    """A start and bins that suit a demonstration (T, 3), or None."""
+    # Streams of their own: with and without bins the start is drawn alike.
+    for_start, for_bins = rng.spawn(2)
+    bins: tuple[Bin, ...] = ()
+    for _ in range(terms.obstacles):
+        bin_ = _place_bin(world, drive, terms.obstacle_offset_m, bins, for_bins)
         if bin_ is None:
             return None
-        world = bin_.in_world(world)
-    start = _jitter(world, piece[0], terms.jitter_scale, for_start)
-    return None if start is None else (start, bin_)
+        bins, world = (*bins, bin_), bin_.in_world(world)
+    start = _jitter(world, drive[0], terms.jitter_scale, for_start)
+    return None if start is None else (start, bins)
 
 
 def _jitter(
@@ -152,64 +149,27 @@ def _jitter(
 
 
 def _place_bin(
-    world: World, piece: NDArray[np.float64], offset_m: float, rng: np.random.Generator
+    world: World,
+    drive: NDArray[np.float64],
+    offset_m: float,
+    others: Sequence[Bin],
+    rng: np.random.Generator,
 ) -> Bin | None:
     """A bin `offset_m` beside a sample of the path, passable on one side, or None."""
     surface = int(rng.integers(len(world.surfaces.texture)))
     for _ in range(_TRIES):
-        sample = int(rng.integers(BIN_MARGIN_SAMPLES, len(piece) - BIN_MARGIN_SAMPLES))
-        x, y, yaw = piece[sample]
+        sample = int(rng.integers(BIN_MARGIN_SAMPLES, len(drive) - BIN_MARGIN_SAMPLES))
+        x, y, yaw = drive[sample]
         left = np.array([-math.sin(yaw), math.cos(yaw)])
         side = 1.0 if rng.random() < 0.5 else -1.0
         centre = np.array([x, y]) + side * offset_m * left
         bin_ = Bin(float(centre[0]), float(centre[1]), surface)
         beside = bin_.radius_m + 0.5 * BIN_PASSAGE_M
         passages = centre + np.array([[beside], [-beside]]) * left  # (2, 2)
-        ends = np.hypot(*(piece[[0, -1], :2] - centre).T)  # (2,)
+        ends = np.hypot(*(drive[[0, -1], :2] - centre).T)  # (2,)
         room = bin_.radius_m + Robot().body_radius_m + START_CLEARANCE_M
-        if world.clearance_at(passages).max() >= 0.5 * BIN_PASSAGE_M and ends.min() > room:
+        apart = all(math.dist(centre, (o.x_m, o.y_m)) >= BIN_APART_M for o in others)
+        passable = world.clearance_at(passages).max() >= 0.5 * BIN_PASSAGE_M
+        if apart and passable and ends.min() > room:
             return bin_
     return None
-
-
-def _route(terms: Terms, world: World, rng: np.random.Generator) -> NDArray[np.float64] | None:
-    """A path (N, 2) somewhat longer than the drive that is cut from it, or None."""
-    drive_m = terms.steps * STEP_S * Robot().max_speed_mps
-    shortest, longest = drive_m + _LEAD_M, drive_m + _TAIL_M
-    try:
-        return sample_routes(world, 1, rng, shortest, longest)[0]
-    except WorldError:
-        return _tour(world, rng, shortest)
-
-
-def _tour(world: World, rng: np.random.Generator, length_m: float) -> NDArray[np.float64] | None:
-    """A path (N, 2) through several random places, for worlds too small for a longer way."""
-    roomy = world.clearance_m[world.clearance_m >= ENDPOINT_CLEARANCE_M]
-    if len(roomy) == 0:
-        return None
-    # Goals are in the middle of rooms and legs end on their way there: there it goes on ahead.
-    free = np.argwhere(world.clearance_m >= np.quantile(roomy, 0.6))[:, ::-1]
-    places = (free + 0.5) * world.resolution_m + np.array(world.origin_m)  # (N, 2)
-    start, legs, refused = rng.choice(places), list[NDArray[np.float64]](), 0
-    for _ in range(_TRIES):
-        here = legs[-1][-1] if legs else start
-        field = GoalField(world, rng.choice(places))
-        reachable = np.isfinite(field.cost_at(here[None])[0])
-        leg = field.path(here) if reachable else here[None]
-        if len(leg) >= _LEG_POINTS and (not legs or _turn(legs[-1], leg) <= _SHARPEST_RAD):
-            legs.append(leg[: max(_LEG_POINTS, round(_LEG_SHARE * len(leg)))])
-            refused = 0
-            if sum(map(len, legs)) * SPACING_M >= length_m:
-                return np.concatenate(legs)
-            continue
-        refused += 1
-        if refused >= _LEG_TRIES:  # a dead end: the last leg leads into a corner
-            start, refused = rng.choice(places) if not legs else start, 0
-            del legs[-1:]
-    return None
-
-
-def _turn(before: NDArray[np.float64], after: NDArray[np.float64]) -> float:
-    """Angle between the end of one path and the beginning of the next."""
-    a, b = before[-1] - before[-7], after[6] - after[0]
-    return abs(math.atan2(float(a[0] * b[1] - a[1] * b[0]), float(a @ b)))

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cbe_bench.episode import Outcome
+from cbe_bench.evaluation import Trace
 from cbe_bench.place import Place
-from cbe_bench.single import Trace
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -59,8 +59,7 @@ def _draw_one(axes: "Axes", trace: Trace, name: str) -> None:
     axes.plot(*trace.demonstration[-1, :2], "*", color=DEMONSTRATION, ms=10)
     axes.plot(*trace.poses[:, :2].T, color=colour, lw=1.3)
     axes.plot(*trace.poses[0, :2], "o", color=colour, ms=4)
-    if trace.bin_ is not None:
-        bin_ = trace.bin_
+    for bin_ in trace.bins:
         axes.add_patch(Circle((bin_.x_m, bin_.y_m), bin_.radius_m, color=BIN))
     if record.outcome is not Outcome.ARRIVED:
         axes.plot(*trace.poses[-1, :2], "X", color=FAILED, ms=9, mec="white")

@@ -5,17 +5,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cbe_bench.single import SingleConfig, run
+from cbe_bench.drives import Pieces
+from cbe_bench.evaluation import RunConfig
+from cbe_bench.single import run
 
 STEPS = (16, 32, 64, 96, 128, 160, 192, 256)
 PAPER_SUCCESS, PAPER_STEPS = 0.95, 128  # "> 95 % for trajectories of up to 128 time steps"
 
 
-def sweep(config: SingleConfig, steps: Sequence[int]) -> dict[str, Any]:
+def sweep(config: RunConfig, steps: Sequence[int]) -> dict[str, Any]:
     """Run each length; the summaries without their single episodes."""
     rows = []
     for length in steps:
-        single = run(replace(config, terms=replace(config.terms, steps=length)), f"{length} steps")
+        terms = replace(config.terms, drives=Pieces(length))
+        single = run(replace(config, terms=terms), f"{length} steps")
         rows.append({"steps": length} | {k: v for k, v in single.summary.items() if k != "runs"})
     return {"lengths": rows, "model_id": rows[0]["model_id"]}
 

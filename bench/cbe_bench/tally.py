@@ -96,11 +96,13 @@ def compare(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, Any]:
         configs = a["config"], b["config"]
         ids = a["model_id"], b["model_id"]
     except (KeyError, TypeError) as error:
-        raise ConfigError(f"not a result of cbe-bench single: {error!r} is missing") from error
+        raise ConfigError(
+            f"not a result of cbe-bench single or route: {error!r} is missing"
+        ) from error
     if not pairs:
         raise ConfigError(
             f"the two results share no episode: a has {configs[0]}, b has {configs[1]}; run both "
-            "with the same --seed, --steps and --world"
+            "with the same --seed, --world and length"
         )
     only_a = sum(x and not y for x, y in pairs)
     only_b = sum(y and not x for x, y in pairs)

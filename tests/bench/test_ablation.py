@@ -8,8 +8,8 @@ import pytest
 
 from cbe.camera import MODEL_CAMERA
 from cbe.signature import ATTRACTOR_SIZE, EMBEDDING_SIZE
-from cbe_bench import scenario, single
-from cbe_bench.ablation import CLONED
+from cbe_bench import evaluation, scenario
+from cbe_bench.ablation import CLONED, PARTS
 from cbe_bench.cli import main
 from cbe_bench.memory import Memory
 from cbe_runtime import routefile
@@ -55,11 +55,11 @@ class NeedsItsMemory:
 @pytest.fixture(autouse=True)
 def dummies(monkeypatch):
     monkeypatch.setattr(scenario, "GROUP", 2)
-    monkeypatch.setattr(single, "GROUP", 2)
+    monkeypatch.setattr(evaluation, "GROUP", 2)
     load = classmethod(lambda cls, folder: NeedsItsMemory(folder.name == "cloned"))
     monkeypatch.setattr(Networks, "load", load)
     yield
-    single._networks.cache_clear()
+    evaluation._networks.cache_clear()
 
 
 @pytest.fixture
@@ -97,6 +97,13 @@ def test_what_is_missing_is_exactly_zero_in_every_precision(route, attractor, em
     assert no_embedding.attractors == packed.attractors
 
 
+def test_without_relocation_only_the_joints_are_missing(route) -> None:
+    there = Memory.NO_RELOCATION.of(route)
+    assert not there.attractor(1).any()
+    assert there.attractors[::2] == route.attractors[::2]
+    assert there.segments == route.segments
+
+
 def test_full_memory_is_the_route_itself(route) -> None:
     assert Memory.FULL.of(route) is route
 
@@ -112,7 +119,7 @@ def ablate(folder, *options):
 def test_each_row_is_paired_with_the_full_memory(tmp_path, capsys) -> None:
     result = ablate(tmp_path)
     full, no_attractors, no_embedding = result["rows"]
-    assert [row["name"] for row in result["rows"]] == list(Memory)
+    assert [row["name"] for row in result["rows"]] == list(PARTS)
     assert "difference" not in full
     assert full["success"] > 0.5
     assert no_attractors["success"] == 0.0
@@ -122,7 +129,7 @@ def test_each_row_is_paired_with_the_full_memory(tmp_path, capsys) -> None:
     assert no_embedding["difference"] == 0.0
     low, high = no_embedding["difference_ci95"]
     assert low < 0.0 < high
-    assert [row["config"]["memory"] for row in result["rows"]] == list(Memory)
+    assert [row["config"]["memory"] for row in result["rows"]] == list(PARTS)
     lines = capsys.readouterr().out.splitlines()
     assert lines[2].split()[:3] == ["without", "attractors", "0.0%"]
     assert float(lines[2].split()[-4]) == -100.0 * full["success"]

@@ -9,12 +9,13 @@ import pytest
 from cbe.errors import ConfigError, WorldError
 from cbe.robot import Robot
 from cbe_bench import scenario as scenario_module
+from cbe_bench.drives import Pieces
 from cbe_bench.place import Place, world_seeds
 from cbe_bench.scenario import Terms, scenarios
-from cbe_hil_sim.floorplan import FloorPlan, from_floorplan
 from cbe_hil_sim.generate import TEST_SEEDS
 
-TERMS = Terms(world="test", steps=30, seed=3)
+STEPS = 30
+TERMS = Terms(world="test", drives=Pieces(STEPS), seed=3)
 GROUP = 3
 
 
@@ -44,7 +45,7 @@ def group(open_place):
 
 @pytest.fixture(scope="module")
 def with_bins(open_place):
-    terms = replace(TERMS, obstacle_offset_m=0.15)
+    terms = replace(TERMS, obstacles=1, obstacle_offset_m=0.15)
     return scenarios(terms, 0, GROUP, TEST_SEEDS, open_place)
 
 
@@ -65,8 +66,8 @@ def test_another_seed_gives_other_episodes(group, open_place) -> None:
 def test_demonstration_has_the_length_asked_for(group) -> None:
     assert len(group) == GROUP
     for _, scenario in group:
-        assert scenario.demonstration.shape == (TERMS.steps + 1, 3)
-        assert scenario.length_m <= TERMS.steps * 0.05 + 1e-6
+        assert scenario.demonstration.shape == (STEPS + 1, 3)
+        assert scenario.length_m <= STEPS * 0.05 + 1e-6
 
 
 def test_starts_are_jittered_within_limits_and_free(group) -> None:
@@ -89,8 +90,8 @@ def test_jitter_scale_keeps_the_drive(group, open_place) -> None:
 
 def test_bin_stands_at_its_offset_away_from_both_ends(with_bins) -> None:
     for _, scenario in with_bins:
-        assert scenario.bin_ is not None
-        centre = (scenario.bin_.x_m, scenario.bin_.y_m)
+        (bin_,) = scenario.bins
+        centre = (bin_.x_m, bin_.y_m)
         distance = np.hypot(*(scenario.demonstration[:, :2] - centre).T)
         assert distance.min() <= 0.15 + 1e-9
         assert math.isclose(distance[10:-10].min(), distance.min())
@@ -98,10 +99,19 @@ def test_bin_stands_at_its_offset_away_from_both_ends(with_bins) -> None:
 
 def test_bin_leaves_a_way_and_is_not_met_at_the_start(with_bins) -> None:
     for place, scenario in with_bins:
-        assert scenario.bin_ is not None
-        standing = scenario.bin_.in_world(place.world)
+        (bin_,) = scenario.bins
+        standing = bin_.in_world(place.world)
         assert standing.blocked.sum() > place.world.blocked.sum()
         assert standing.clearance_at(scenario.start[:2]) > Robot().body_radius_m
+
+
+def test_several_bins_stand_apart_and_the_first_where_it_stood_alone(with_bins, open_place) -> None:
+    terms = replace(TERMS, drives=Pieces(120), obstacles=1)
+    _, one = scenarios(terms, 0, 1, TEST_SEEDS, open_place)[0]
+    _, two = scenarios(replace(terms, obstacles=2), 0, 1, TEST_SEEDS, open_place)[0]
+    first, second = two.bins
+    assert math.dist((first.x_m, first.y_m), (second.x_m, second.y_m)) >= 1.5
+    assert one.bins == (first,)
 
 
 def test_world_without_room_is_an_error_that_says_so(open_place) -> None:
@@ -122,14 +132,3 @@ def test_world_without_room_is_an_error_that_says_so(open_place) -> None:
 def test_worlds_outside_the_split_are_refused(world, chosen) -> None:
     with pytest.raises(ConfigError):
         world_seeds(world, chosen)
-
-
-def test_small_world_is_toured_until_the_length_is_reached() -> None:
-    # Two rooms of 3 m in which no straight way is 10 m long.
-    plan = np.ones((80, 140), np.bool_)
-    plan[4:-4, 4:68] = plan[4:-4, 72:-4] = plan[30:50, 68:72] = False
-    world = from_floorplan(FloorPlan(plan, 0.05))
-    path = scenario_module._tour(world, np.random.default_rng(0), 10.0)
-    assert path is not None
-    assert np.hypot(*np.diff(path, axis=0).T).sum() >= 9.5
-    assert world.clearance_at(path).min() > Robot().body_radius_m

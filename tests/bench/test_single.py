@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cbe.camera import MODEL_CAMERA
-from cbe_bench import scenario, single
+from cbe_bench import evaluation, scenario
 from cbe_bench.cli import main
 from cbe_runtime.networks import Networks, Prediction
 
@@ -44,10 +44,10 @@ class StraightOn:
 @pytest.fixture(autouse=True)
 def straight_on(monkeypatch):
     monkeypatch.setattr(scenario, "GROUP", 2)
-    monkeypatch.setattr(single, "GROUP", 2)
+    monkeypatch.setattr(evaluation, "GROUP", 2)
     monkeypatch.setattr(Networks, "load", classmethod(lambda cls, folder: StraightOn()))
     yield
-    single._networks.cache_clear()
+    evaluation._networks.cache_clear()
 
 
 def run(command, folder, *options):

@@ -1,0 +1,128 @@
+"""Options that the commands of cbe-bench share, and the runs that they ask for."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cbe_runtime.route import AttractorPrecision
+
+if TYPE_CHECKING:
+    from cbe_bench.drives import Drives
+    from cbe_bench.evaluation import RunConfig
+
+
+def add_run(parser: argparse.ArgumentParser) -> None:
+    """What all runs of episodes take."""
+    parser.add_argument("--episodes", type=int, default=500, help="how many (%(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="of worlds, drives, starts and noise")
+    parser.add_argument(
+        "--world", default="test", metavar="val|test|SCENE_DIR|PGM_YAML",
+        help="generated worlds of a split, a mesh scene or a floor plan (%(default)s)",
+    )  # fmt: skip
+    jitter = parser.add_mutually_exclusive_group()
+    jitter.add_argument(
+        "--jitter-scale", type=float, default=1.0, help="times the paper's jitter (%(default)s)"
+    )
+    jitter.add_argument(
+        "--no-jitter", action="store_const", const=0.0, dest="jitter_scale",
+        help="start at the demonstration's first pose",
+    )  # fmt: skip
+    parser.add_argument("--world-seeds", type=_range, metavar="A:B", help="worlds A to B-1 only")
+    parser.add_argument("--backend", choices=("column", "bullet"), default="column")
+    parser.add_argument(
+        "--noise", type=float, default=0.0, metavar="S", help="actuation noise, the paper's s"
+    )
+    add_model(parser)
+    add_output(parser)
+
+
+def add_model(parser: argparse.ArgumentParser) -> None:
+    """Which model, in how many processes."""
+    parser.add_argument("--model", type=Path, metavar="DIR", help="folder of ONNX files")
+    parser.add_argument("--jobs", type=int, default=0, metavar="N", help="processes (one a core)")
+
+
+def add_output(parser: argparse.ArgumentParser) -> None:
+    """Where the result goes."""
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the result")
+
+
+def add_behaviors(parser: argparse.ArgumentParser) -> None:
+    """Runs of single behaviors, but for their length."""
+    add_run(parser)
+    parser.add_argument(
+        "--obstacle-offset", type=float, metavar="M", help="put a bin so far beside the path"
+    )
+
+
+def add_journeys(parser: argparse.ArgumentParser) -> None:
+    """Runs of long drives."""
+    parser.add_argument(
+        "--length-m", type=float, default=20.0, metavar="M", help="about so long (%(default)s)"
+    )
+    add_run(parser)
+    parser.add_argument(
+        "--obstacles", type=int, default=0, metavar="N", help="put so many bins on the path"
+    )
+
+
+def behaviors(options: argparse.Namespace, steps: int) -> "RunConfig":
+    """The run of single behaviors asked for.
+
+    Raises:
+        ConfigError: it cannot be run.
+    """
+    from cbe_bench.drives import Pieces
+
+    offset_m: float | None = options.obstacle_offset
+    return _run(options, Pieces(steps), int(offset_m is not None), offset_m or 0.0)
+
+
+def journeys(options: argparse.Namespace) -> "RunConfig":
+    """The run of long drives asked for.
+
+    Raises:
+        ConfigError: it cannot be run.
+    """
+    from cbe_bench.drives import Journeys
+
+    return _run(options, Journeys(options.length_m), options.obstacles, 0.0)
+
+
+def _run(
+    options: argparse.Namespace, drives: "Drives", obstacles: int, offset_m: float
+) -> "RunConfig":
+    from cbe_bench.evaluation import RunConfig
+    from cbe_bench.scenario import Terms
+
+    return RunConfig(
+        Terms(options.world, drives, options.seed, options.jitter_scale, obstacles, offset_m),
+        episodes=options.episodes,
+        world_seeds=options.world_seeds,
+        backend=options.backend,
+        noise=options.noise,
+        model=model(options),
+        jobs=options.jobs,
+    )
+
+
+def model(options: argparse.Namespace) -> Path:
+    """The model's folder; the shipped one where none is named."""
+    from cbe_runtime.networks import PACKAGED_MODELS
+
+    return options.model or PACKAGED_MODELS
+
+
+def integers(text: str) -> list[int]:
+    """Numbers between commas."""
+    return [int(part) for part in text.split(",")]
+
+
+def precisions(text: str) -> list[AttractorPrecision]:
+    """Precisions between commas."""
+    return [AttractorPrecision(part) for part in text.split(",")]
+
+
+def _range(text: str) -> range:
+    first, _, end = text.partition(":")
+    return range(int(first), int(end))
