@@ -14,6 +14,8 @@ Pixels = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 
 MAX_SIDE_PX = 16_384
+MAX_NUMBER = 1e6
+"""Far beyond any lens; its powers are still finite."""
 MIN_VIEW_SHARE = 0.5
 MAX_SUPERSAMPLE = 4
 COEFFICIENTS = {"pinhole": (0, 4, 5, 8), "fisheye": (0, 4)}
@@ -56,15 +58,19 @@ class CameraModel:
                 f"camera size {self.width} x {self.height} px is outside 1 to {MAX_SIDE_PX}"
             )
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
-        if not all(math.isfinite(number) for number in numbers):
-            raise CameraError(f"camera intrinsics must be finite; found {numbers}")
+        if not all(abs(number) <= MAX_NUMBER for number in numbers):  # nor NaN
+            raise CameraError(
+                f"camera intrinsics must lie within +-{MAX_NUMBER:g}; found {numbers[:12]}"
+            )
         if min(self.fx, self.fy) <= 0.0:
             raise CameraError(
                 f"focal lengths must be positive pixels; found fx {self.fx}, fy {self.fy}; "
                 "an uncalibrated camera publishes zeros: calibrate it"
             )
         if self.model not in COEFFICIENTS:
-            raise CameraError(f"unknown camera model {self.model!r}; known: {list(COEFFICIENTS)}")
+            raise CameraError(
+                f"unknown camera model {self.model[:32]!r}; known: {list(COEFFICIENTS)}"
+            )
         if len(self.distortion) not in COEFFICIENTS[self.model]:
             raise CameraError(
                 f"{self.model} takes {COEFFICIENTS[self.model]} distortion coefficients; "
@@ -86,7 +92,7 @@ class CameraModel:
         """
         if distortion_model not in ROS_MODELS:
             raise CameraError(
-                f"unknown distortion model {distortion_model!r}; known: {list(ROS_MODELS)}"
+                f"unknown distortion model {distortion_model[:32]!r}; known: {list(ROS_MODELS)}"
             )
         if len(matrix) != 9:
             raise CameraError(f"a camera matrix has 9 numbers; found {len(matrix)}")
@@ -122,19 +128,26 @@ class CameraModel:
         names = {field.name for field in fields(cls)}
         required = names - {"model", "distortion"}
         if not required <= values.keys() <= names:
-            raise CameraError(f"a camera has entries {sorted(names)}; found {sorted(values)}")
+            raise CameraError(
+                f"a camera has entries {sorted(names)}; found {str(sorted(values))[:200]}"
+            )
         values = {"model": "pinhole", "distortion": (), **values}
         sizes = (values["width"], values["height"])
         numbers = [values[name] for name in ("fx", "fy", "cx", "cy")]
         if not isinstance(values["distortion"], (list, tuple)):
-            raise CameraError(f"distortion must be a list; found {values['distortion']!r}")
+            raise CameraError("distortion must be a list of numbers")
         numbers += values["distortion"]
         if (
             not all(type(size) is int for size in sizes)
             or not all(type(number) in (int, float) for number in numbers)
             or not isinstance(values["model"], str)
         ):
-            raise CameraError(f"a camera's entries have wrong types: {dict(values)}")
+            raise CameraError(
+                "a camera's width and height are whole numbers, its model is a name, the others "
+                f"are numbers; found {str(dict(values))[:200]}"
+            )
+        if not all(abs(number) <= MAX_NUMBER for number in (*sizes, *numbers)):
+            raise CameraError(f"a camera's numbers must lie within +-{MAX_NUMBER:g}")
         fx, fy, cx, cy, *distortion = (float(number) for number in numbers)
         return cls(*sizes, fx, fy, cx, cy, values["model"], tuple(distortion))
 
@@ -292,7 +305,10 @@ def _rays(view: CameraModel, factor: int) -> tuple[Floats, Floats]:
 
 
 def _pixel_pitch(camera: CameraModel, view: CameraModel) -> float:
-    """Camera pixels from one pixel of the view to the next, where the camera sees."""
+    """Camera pixels from one pixel of the view to the next, where the camera sees both.
+
+    Raises CameraError where it sees no two neighbours.
+    """
     u, v, seen = camera.project(*_rays(view, 1))
     steps = [
         np.hypot(np.diff(u, axis=axis), np.diff(v, axis=axis))[
@@ -301,6 +317,8 @@ def _pixel_pitch(camera: CameraModel, view: CameraModel) -> float:
         ]
         for axis in (0, 1)
     ]
+    if not all(step.size for step in steps):
+        raise CameraError("the camera's lens scatters what it sees; check its calibration")
     return max(float(np.median(step)) for step in steps)
 
 

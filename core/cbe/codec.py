@@ -72,7 +72,7 @@ class Message(ABC):
         from rosbags.serde import SerdeError
 
         try:
-            ros = _typestore().deserialize_cdr(data, cls.TYPE)
+            ros = _typestore().deserialize_cdr(memoryview(data), cls.TYPE)
         except (SerdeError, struct.error, ValueError, IndexError, OverflowError) as error:
             raise MessageError(
                 f"{len(data)} bytes are no {cls.TYPE}: {error}; check the sender's message type"

@@ -47,10 +47,10 @@ def resample(scan: LaserScan, robot: Robot = Robot()) -> NDArray[np.float32]:
 
     # The beam closest to each ray; half a beam's width is let in at either end of the scan.
     turned = np.sign(increment) * (ray_rad - scan.angle_min_rad) + 0.5 * abs(increment)
-    beam = np.floor(turned % TURN / abs(increment)).astype(np.intp)
+    beam = np.floor(turned % TURN / abs(increment))
     points = beam < len(ranges)
     out = np.full(robot.scan_rays, np.nan, np.float32)
-    out[points] = ranges[beam[points]]
+    out[points] = ranges[beam[points].astype(np.intp)]
 
     # The ray closest to each beam.
     ahead_rad = (beam_rad + math.pi) % TURN - math.pi
@@ -90,6 +90,7 @@ def _check(scan: LaserScan) -> None:
 def _clean(scan: LaserScan, robot: Robot) -> NDArray[np.float32]:
     """Ranges (n,) with NaN where invalid and +inf where nothing is within reach."""
     ranges = scan.ranges_m.astype(np.float32)
+    ranges[np.isnan(ranges)] = np.nan  # a signalling NaN warns wherever it is compared
     too_close = np.isneginf(ranges)
     # Many drivers write 0 for "no measurement", whatever their least range.
     invalid = (ranges < scan.range_min_m) | (ranges <= 0.0)

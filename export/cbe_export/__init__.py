@@ -1,1 +1,1 @@
-"""From a training checkpoint to the three ONNX graphs a board runs, gated by parity."""
+"""From a training checkpoint to the ONNX graphs a board runs, gated by parity."""

@@ -7,13 +7,22 @@ import importlib
 import logging
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
-from cbe.errors import CbeError
+from cbe.errors import CbeError, ConfigError
 
 EXIT_REFUSED = 2
 """Bad options, files or peers: the message says what to do."""
 
 Arguments = Sequence[str] | None
+
+
+class Parser(argparse.ArgumentParser):
+    """Refuses options as everything else is refused, wherever they come from."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise what is wrong as a ConfigError."""
+        raise ConfigError(f"{message[:300]}; see {self.prog} --help")
 
 
 def runtime_main(arguments: Arguments = None) -> int:
@@ -49,9 +58,7 @@ def keys_main(arguments: Arguments = None) -> int:
 def _run(program: str, module: str, arguments: Arguments) -> int:
     """Import only the command in question: a board starts faster."""
     command = importlib.import_module(f"cbe_runtime.{module}")
-    parser = argparse.ArgumentParser(
-        prog=program, description=command.DESCRIPTION, allow_abbrev=False
-    )
+    parser = Parser(prog=program, description=command.DESCRIPTION, allow_abbrev=False)
     parser.add_argument("--verbose", action="store_true", help="log more")
     command.add_options(parser)
     tokens = sys.argv[1:] if arguments is None else list(arguments)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import sys
 from pathlib import Path
 from threading import Event
@@ -10,12 +11,13 @@ from typing import TYPE_CHECKING
 
 from cbe.errors import ConfigError
 from cbe.link import Link
+from cbe_runtime import forecast, lint, routefile
 from cbe_runtime import options as shared
-from cbe_runtime import routefile
 from cbe_runtime.command_runtime import exit_on_signals
 from cbe_runtime.drive import RecordedDrive
 from cbe_runtime.live import LiveDrive
 from cbe_runtime.networks import Networks
+from cbe_runtime.perturb import PERTURBATIONS, TURNS
 from cbe_runtime.progressbar import track
 from cbe_runtime.route import Precision
 from cbe_runtime.teach import Teacher
@@ -23,6 +25,8 @@ from cbe_runtime.view import View
 
 if TYPE_CHECKING:
     from cbe_runtime.route import Route
+
+logger = logging.getLogger(__name__)
 
 DESCRIPTION = "Make a route of a recorded drive (any ROS 2 MCAP with a camera), or of a live one."
 
@@ -46,6 +50,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="longest segment in steps of 0.1 s (default: the model's)",
     )
     parser.add_argument("--name", help="name to store in the route")
+    parser.add_argument(
+        "--lint",
+        action="store_true",
+        help="replay the recording with perturbed images too, and say all that was found, as "
+        "cbe-route lint does",
+    )
     shared.add_precision(parser)
     shared.add_camera(parser)
     shared.add_model(parser)
@@ -63,7 +73,8 @@ def run(options: argparse.Namespace) -> int:
     if options.segment_steps is not None and options.segment_steps < 2:
         raise ConfigError(f"--segment-steps must be 2 or more; found {options.segment_steps}")
     networks = Networks.load(options.model)
-    route = _live(options, networks) if options.live else _recorded(options, networks)
+    drive = None if options.live else _open(options)
+    route = _live(options, networks) if drive is None else _recorded(options, networks, drive)
     size = routefile.save(route, options.output)
     sys.stdout.write(
         f"{options.output}: {size} bytes, {route.steps} steps in {len(route.segments)} segments, "
@@ -72,11 +83,30 @@ def run(options: argparse.Namespace) -> int:
     if options.recording is not None:
         drive_bytes = options.recording.stat().st_size
         sys.stdout.write(f"the drive's recording: {drive_bytes} bytes\n")
+    _look_over(options, networks, route, drive)
     return 0
 
 
-def _recorded(options: argparse.Namespace, networks: Networks) -> Route:
-    drive = RecordedDrive.open(options.recording, options.topic, shared.read_camera(options.camera))
+def _open(options: argparse.Namespace) -> RecordedDrive:
+    camera = shared.read_camera(options.camera)
+    return RecordedDrive.open(options.recording, options.topic, camera)
+
+
+def _look_over(
+    options: argparse.Namespace, networks: Networks, route: Route, drive: RecordedDrive | None
+) -> None:
+    """Say how the route may be repeated; of a live drive, whose frames are gone, only a part."""
+    frames = track(drive.frames(), "looking over", route.steps + 1) if drive else None
+    # Each costs as much as teaching did; turned views tell the most.
+    perturbations = PERTURBATIONS if options.lint else TURNS
+    verdict = forecast.judge(lint.look_over(networks, route, frames, perturbations))
+    lines = verdict.lines() if options.lint else [verdict.summary()]
+    sys.stdout.writelines(f"{line}\n" for line in lines)
+    if not verdict.passed:
+        logger.warning("the route may fail: cbe-route lint says where; consider another drive")
+
+
+def _recorded(options: argparse.Namespace, networks: Networks, drive: RecordedDrive) -> Route:
     # Equal segments need the drive's length: one pass to count, one to teach.
     frames = sum(1 for _ in track(drive.frames(), "counting frames"))
     teacher = _teacher(options, networks, View(drive.camera), total_steps=frames - 1)

@@ -115,16 +115,14 @@ class RecordedDrive:
             RecordingError: there is no camera topic, or several and none is named.
             CameraError: the camera is not calibrated or covers too little.
         """
-        first: dict[str, mcapfile.Recorded] = {}
-        for message in mcapfile.read(path):
-            first.setdefault(message.topic, message)
-        cameras = [name for name, message in first.items() if message.type_name in IMAGE_TYPES]
+        types = _types(path)
+        cameras = [name for name, type_name in types.items() if type_name in IMAGE_TYPES]
         chosen = _choose(path, cameras, topic)
         view = View(camera)
-        info = _calibration_of(chosen, first)
+        info = _calibration_of(chosen, types)
         if info is not None:
-            view.calibrate(CameraInfo.from_cdr(info.data))
-        _render(view, first[chosen])
+            view.calibrate(CameraInfo.from_cdr(_first(path, info, types[info]).data))
+        _render(view, _first(path, chosen, types[chosen]))
         assert view.camera is not None
         return cls(path, chosen, view.camera)
 
@@ -132,7 +130,7 @@ class RecordedDrive:
         """The drive's views (64, 64, 3) uint8 RGB, one a step; waiting and bad frames left out."""
         frames = StepFrames(View(self.camera))
         for message in mcapfile.read(self.path):
-            if message.topic == self.topic:
+            if message.topic == self.topic and message.type_name in IMAGE_TYPES:
                 seen = frames.take(
                     IMAGE_TYPES[message.type_name], message.data, message.log_time_ns
                 )
@@ -140,6 +138,14 @@ class RecordedDrive:
                     yield seen
         if frames.damaged:
             logger.warning("%s: left out %d frames that do not decode", self.path, frames.damaged)
+
+
+def _types(path: Path) -> dict[str, str]:
+    """The type of each topic's first message; holds on to no message, which may be large."""
+    types: dict[str, str] = {}
+    for message in mcapfile.read(path):
+        types.setdefault(message.topic, message.type_name)
+    return types
 
 
 def _choose(path: Path, cameras: list[str], topic: str | None) -> str:
@@ -151,18 +157,28 @@ def _choose(path: Path, cameras: list[str], topic: str | None) -> str:
         raise RecordingError(
             f"{path} holds no camera topic ({' or '.join(IMAGE_TYPES)}); record the camera"
         )
+    listed = ", ".join(cameras[:10]) + (", ..." if len(cameras) > 10 else "")
     wanted = "several camera topics" if topic is None else f"no camera topic {topic}"
-    raise RecordingError(f"{path} has {wanted}; choose one with --topic: {', '.join(cameras)}")
+    raise RecordingError(f"{path} has {wanted}; choose one with --topic: {listed}")
 
 
-def _calibration_of(topic: str, first: dict[str, mcapfile.Recorded]) -> mcapfile.Recorded | None:
+def _calibration_of(topic: str, types: dict[str, str]) -> str | None:
     """The CameraInfo beside an image topic, or the only one there is."""
-    infos = [each for each in first.values() if each.type_name == CameraInfo.TYPE]
+    infos = [name for name, type_name in types.items() if type_name == CameraInfo.TYPE]
     folders = {topic.rsplit("/", depth)[0] for depth in (1, 2)}
-    beside = [each for each in infos if each.topic.rsplit("/", 1)[0] in folders]
+    beside = [name for name in infos if name.rsplit("/", 1)[0] in folders]
     if len(beside or infos) == 1:
         return (beside or infos)[0]
     return None
+
+
+def _first(path: Path, topic: str, type_name: str) -> mcapfile.Recorded:
+    """A topic's first message, known to be there."""
+    return next(
+        message
+        for message in mcapfile.read(path)
+        if (message.topic, message.type_name) == (topic, type_name)
+    )
 
 
 def _render(view: View, message: mcapfile.Recorded) -> None:

@@ -41,6 +41,14 @@ class FollowerConfig:
     timeout_factor: float = 3.0  # a segment may take this many times the demonstration's steps
     timeout_steps: int = 100  # ... and this many more
 
+    def ends(self, prediction: Prediction, *, last: bool) -> bool:
+        """Whether a tick says that the behavior, the route's last or another, is done."""
+        progress = prediction.progress
+        if progress >= (self.arrival_progress if last else self.switch_progress):
+            return True
+        range_m = math.hypot(*prediction.waypoint_m) - OVERRUN_M
+        return progress >= self.resting_progress and range_m < self.resting_range_m
+
 
 @dataclass(frozen=True, slots=True)
 class Decision:
@@ -189,12 +197,10 @@ class Follower:
 
     def _judge_progress(self, prediction: Prediction) -> None:
         """Start the next behavior, or arrive, once enough ticks in a row say so."""
-        last, config = self._behavior.last, self._config
-        done = prediction.progress >= (config.arrival_progress if last else config.switch_progress)
-        if prediction.progress >= config.resting_progress:
-            done |= math.hypot(*prediction.waypoint_m) < OVERRUN_M + config.resting_range_m
+        last = self._behavior.last
+        done = self._config.ends(prediction, last=last)
         self._done_ticks = self._done_ticks + 1 if done else 0
-        if self._done_ticks < config.progress_ticks:
+        if self._done_ticks < self._config.progress_ticks:
             return
         if last:
             self._machine.update(Events(arrived=True))

@@ -5,15 +5,17 @@ from __future__ import annotations
 import logging
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from io import BytesIO
+from typing import IO, TYPE_CHECKING, Self
 
-from mcap import stream_reader
-from mcap.exceptions import McapError
-from mcap.records import Channel, Chunk, DataEnd, Message, Schema
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
 from mcap.writer import CompressionType, Writer
 
 from cbe.errors import RecordingError
 from cbe.messages import MESSAGE_TYPES
+from cbe_runtime.mcaprecords import DAMAGE, Damaged, records
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -22,12 +24,12 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-MAX_RECORD_BYTES = 256 * 2**20
+MAX_DESCRIPTION_BYTES = 256 * 2**10
+MAX_TOPIC = 256
 CHUNK_BYTES = 128 * 2**10
 """What a power cut can cost: a few seconds of one camera."""
 
-# zstandard's error derives from Exception alone, and a cut record shows in any of the others.
-DAMAGE = (McapError, struct.error, ValueError, EOFError, stream_reader.zstandard.ZstdError)  # type: ignore[attr-defined]
+_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, time of recording, time of sending
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,15 +53,12 @@ def read(path: Path) -> Iterator[Recorded]:
     count = 0
     try:
         with path.open("rb") as file:
-            reader = stream_reader.StreamReader(
-                file, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES
-            )
-            for message in _messages(reader):
+            for message in _messages(file, path.stat().st_size):
                 count += 1
                 yield message
     except OSError as error:
         raise RecordingError(f"cannot read {path}: {error.strerror}; check the path") from error
-    except _Damaged as damaged:
+    except Damaged as damaged:
         if count == 0:
             raise RecordingError(
                 f"{path} is no readable MCAP recording ({damaged}); check the file"
@@ -77,36 +76,40 @@ def read(path: Path) -> Iterator[Recorded]:
         )
 
 
-class _Damaged(Exception):
-    """The stream ends or breaks before its end mark."""
-
-
-def _messages(reader: stream_reader.StreamReader) -> Iterator[Recorded]:
+def _messages(file: IO[bytes], size: int) -> Iterator[Recorded]:
     schemas: dict[int, str] = {}
     channels: dict[int, tuple[str, str]] = {}
-    for record in _records(reader):
-        if isinstance(record, Schema):
-            schemas[record.id] = record.name
-        elif isinstance(record, Channel):
-            type_name = schemas.get(record.schema_id)
-            if record.message_encoding == "cdr" and type_name in MESSAGE_TYPES:
-                channels[record.id] = (record.topic, type_name)
-        elif isinstance(record, Message) and record.channel_id in channels:
-            yield Recorded(*channels[record.channel_id], record.data, record.log_time)
-
-
-def _records(reader: stream_reader.StreamReader) -> Iterator[object]:
-    """Records up to the end of the data section, chunks opened."""
-    try:
-        for record in reader.records:
-            if isinstance(record, DataEnd):
+    entries = records(file, size)
+    while True:
+        try:
+            opcode, content = next(entries, (Opcode.DATA_END, memoryview(b"")))
+            if opcode == Opcode.DATA_END:
                 return
-            if isinstance(record, Chunk):
-                yield from stream_reader.breakup_chunk(record, validate_crc=True)
-            else:
-                yield record
-    except DAMAGE as error:
-        raise _Damaged(str(error) or type(error).__name__) from error
+            if opcode == Opcode.MESSAGE:
+                channel_id, _, log_time_ns, _ = _MESSAGE.unpack_from(content)
+            elif opcode == Opcode.SCHEMA:
+                schema = Schema.read(_described(content))
+                schemas.pop(schema.id, None)
+                if schema.name in MESSAGE_TYPES:
+                    schemas[schema.id] = schema.name
+            elif opcode == Opcode.CHANNEL:
+                channel = Channel.read(_described(content))
+                channels.pop(channel.id, None)
+                if len(channel.topic) > MAX_TOPIC:
+                    raise Damaged(f"a topic's name has {len(channel.topic)} characters")
+                if channel.message_encoding == "cdr" and channel.schema_id in schemas:
+                    channels[channel.id] = (channel.topic, schemas[channel.schema_id])
+        except DAMAGE as error:
+            raise Damaged(str(error)[:200] or type(error).__name__) from error
+        if opcode == Opcode.MESSAGE and channel_id in channels:
+            data = bytes(content[_MESSAGE.size :])
+            yield Recorded(*channels[channel_id], data, log_time_ns)
+
+
+def _described(content: memoryview) -> ReadDataStream:
+    if len(content) > MAX_DESCRIPTION_BYTES:
+        raise Damaged(f"a schema or channel has {len(content)} bytes")
+    return ReadDataStream(BytesIO(content))
 
 
 class Recorder:

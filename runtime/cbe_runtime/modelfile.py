@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import onnxruntime as ort
 from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
@@ -12,12 +13,15 @@ from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 from cbe import signature
 from cbe.camera import CameraModel
 from cbe.errors import CameraError, ModelError
+from cbe_runtime import modelheader
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-MAX_FILE_BYTES = 200 * 2**20
-"""Far above the shipped files, so that a wrong file is refused before onnxruntime parses it."""
+MAX_FILE_BYTES = 48 * 2**20
+"""Far above the shipped files; a wrong file is refused before it is read."""
+MAX_STATE = 8192
+MAX_SEGMENT_STEPS = 1_000_000
 
 # onnxruntime raises these, each derived from Exception alone.
 ORT_FAULTS = (
@@ -31,6 +35,7 @@ ORT_FAULTS = (
     ort_errors.NoSuchFile,
     ort_errors.NotImplemented,
     ort_errors.RuntimeException,
+    UnicodeDecodeError,  # its message quotes a name of the file's that is no text
 )
 
 
@@ -45,19 +50,44 @@ class Metadata:
     precision: str
 
 
-def open_session(path: Path) -> ort.InferenceSession:
+@dataclass(frozen=True, slots=True)
+class ModelFile:
+    """One ONNX file and what it says about itself."""
+
+    path: Path
+    header: modelheader.Header
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Read a file and its header.
+
+        Raises:
+            ModelError: the file is missing, too large, no ONNX, or holds what no model of ours
+                does.
+        """
+        try:
+            with path.open("rb") as file:
+                data = file.read(MAX_FILE_BYTES + 1)
+        except FileNotFoundError as error:
+            raise ModelError(
+                f"no {path.name} in {path.parent}; give a folder with the three networks"
+            ) from error
+        except OSError as error:
+            raise ModelError(f"cannot read {path}: {error.strerror}; check the file") from error
+        if len(data) > MAX_FILE_BYTES:
+            raise ModelError(f"{path} has more than {MAX_FILE_BYTES} bytes; is it the right file?")
+        try:
+            return cls(path, modelheader.parse(data))
+        except ModelError as error:
+            raise ModelError(f"{path} is {error}") from error
+
+
+def open_session(file: ModelFile) -> ort.InferenceSession:
     """A session on one ONNX file: one thread, sequential, no spinning.
 
     Raises:
-        ModelError: the file is missing, too large or no ONNX.
+        ModelError: onnxruntime cannot build it.
     """
-    if not path.is_file():
-        raise ModelError(f"no {path.name} in {path.parent}; give a folder with the three networks")
-    size = path.stat().st_size
-    if size > MAX_FILE_BYTES:
-        raise ModelError(
-            f"{path} has {size} bytes, more than {MAX_FILE_BYTES}; is it the right file?"
-        )
     options = ort.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
@@ -67,57 +97,57 @@ def open_session(path: Path) -> ort.InferenceSession:
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
     options.log_severity_level = 3  # errors reach the user as ModelError
     try:
-        return ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        return ort.InferenceSession(str(file.path), options, providers=["CPUExecutionProvider"])
     except ORT_FAULTS as fault:
         raise ModelError(
-            f"{path} is no usable ONNX file ({fault}); export the model again"
+            f"{file.path} is no usable ONNX file ({str(fault)[:300]}); export the model again"
         ) from fault
 
 
-def state_size(session: ort.InferenceSession) -> int:
+def state_size(file: ModelFile) -> int:
     """Width of the recurrent state, the one size the signature leaves open; 0 if none is stated."""
-    shapes = [node.shape for node in session.get_inputs() if node.name == "h"]
+    shapes = [tensor.shape for tensor in file.header.inputs if tensor.name == "h"]
     width = shapes[0][-1] if shapes and shapes[0] else 0
-    return width if isinstance(width, int) else 0
+    return width if 0 < width <= MAX_STATE else 0
 
 
-def check_graph(session: ort.InferenceSession, graph: signature.Graph) -> None:
-    """Hold a session's inputs and outputs against the signature's.
+def check_graph(file: ModelFile, graph: signature.Graph) -> None:
+    """Hold a file's inputs and outputs against the signature's.
 
     Raises:
         ModelError: a name, shape or type differs.
     """
-    for side, nodes, tensors in (
-        ("inputs", session.get_inputs(), graph.inputs),
-        ("outputs", session.get_outputs(), graph.outputs),
+    for side, found, tensors in (
+        ("inputs", file.header.inputs, graph.inputs),
+        ("outputs", file.header.outputs, graph.outputs),
     ):
-        found = [signature.Tensor(node.name, tuple(node.shape), node.type) for node in nodes]
-        if found != list(tensors):
+        if found != tensors:
             raise ModelError(
                 f"{graph.name}.onnx has {side} {_listed(found)}, expected {_listed(tensors)}; "
                 "export it again with this version"
             )
 
 
-def _listed(tensors: list[signature.Tensor] | tuple[signature.Tensor, ...]) -> str:
-    return ", ".join(f"{tensor.name}{list(tensor.shape)} {tensor.dtype}" for tensor in tensors)
+def _listed(tensors: tuple[signature.Tensor, ...]) -> str:
+    listed = [f"{each.name[:40]}{list(each.shape[:6])} {each.dtype}" for each in tensors[:10]]
+    return ", ".join(listed) or "none"
 
 
-def read_metadata(session: ort.InferenceSession) -> Metadata:
-    """The metadata of a session's file.
+def read_metadata(file: ModelFile) -> Metadata:
+    """The metadata of a file.
 
     Raises:
         ModelError: a key is missing or a value out of range.
     """
-    stored = session.get_modelmeta().custom_metadata_map
+    stored = file.header.metadata
     missing = [key for key in signature.METADATA_KEYS if key not in stored]
     if missing:
         raise ModelError(f"the model lacks metadata {', '.join(missing)}; export it again")
     version = stored["cbe.contract_version"]
     if version != str(signature.CONTRACT_VERSION):
         raise ModelError(
-            f"the model has contract version {version}, expected {signature.CONTRACT_VERSION}; "
-            "export it again with this version"
+            f"the model has contract version {version[:20]}, expected "
+            f"{signature.CONTRACT_VERSION}; export it again with this version"
         )
     try:
         metadata = Metadata(
@@ -127,12 +157,18 @@ def read_metadata(session: ort.InferenceSession) -> Metadata:
             segment_steps=int(stored["cbe.segment_steps"]),
             precision=stored["cbe.precision"],
         )
-        known_id = len(bytes.fromhex(metadata.model_id)) == 8
-    except (ValueError, CameraError) as error:
-        raise ModelError(f"the model's metadata is damaged ({error}); export it again") from error
-    if not known_id or metadata.network_period not in (1, 2) or metadata.segment_steps < 1:
+    except (ValueError, TypeError, AttributeError, RecursionError, CameraError) as error:
         raise ModelError(
-            f"the model's metadata is out of range (model_id {metadata.model_id}, network_period "
-            f"{metadata.network_period}, segment_steps {metadata.segment_steps}); export it again"
+            f"the model's metadata is damaged ({str(error)[:300]}); export it again"
+        ) from error
+    if (
+        not re.fullmatch("[0-9a-f]{16}", metadata.model_id)
+        or metadata.network_period not in (1, 2)
+        or not 1 <= metadata.segment_steps <= MAX_SEGMENT_STEPS
+    ):
+        raise ModelError(
+            f"the model's metadata is out of range (model_id {metadata.model_id[:20]}, "
+            f"network_period {stored['cbe.network_period'][:20]}, segment_steps "
+            f"{stored['cbe.segment_steps'][:20]}); export it again"
         )
     return metadata

@@ -11,7 +11,14 @@ import onnxruntime as ort
 
 from cbe import signature
 from cbe.errors import ModelError
-from cbe_runtime.modelfile import ORT_FAULTS, check_graph, open_session, read_metadata, state_size
+from cbe_runtime.modelfile import (
+    ORT_FAULTS,
+    ModelFile,
+    check_graph,
+    open_session,
+    read_metadata,
+    state_size,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -71,39 +78,42 @@ class Networks:
         self._attractor = attractor
         self._generator = generator
         self._metadata = metadata
-        self._encoder_size = state_size(encoder)
-        self._generator_size = state_size(generator)
         self._first_state = EncoderState(
             np.zeros((1, *signature.FEATURES), np.float32),
             np.ones(1, np.float32),
-            *_zero_state(self._encoder_size),
+            *_zero_state(encoder),
         )
-        self._first_generator_state = GeneratorState(*_zero_state(self._generator_size))
+        self._first_generator_state = GeneratorState(*_zero_state(generator))
         self._not_first = np.zeros(1, np.float32)
 
     @classmethod
     def load(cls, folder: Path = PACKAGED_MODELS) -> Networks:
         """Open `encoder.onnx`, `attractor.onnx` and `generator.onnx` of `folder`.
 
+        All is checked before anything is built.
+
         Raises:
             ModelError: a file is missing, too large or no ONNX; names, shapes or types differ
                 from `cbe.signature`; metadata is missing; or the three are of different models.
         """
-        sessions = [
-            open_session(folder / f"{name}.onnx") for name in ("encoder", "attractor", "generator")
+        files = [
+            ModelFile.read(folder / f"{name}.onnx")
+            for name in ("encoder", "attractor", "generator")
         ]
-        encoder, attractor, generator = sessions
+        encoder, attractor, generator = files
         check_graph(encoder, signature.encoder(state_size(encoder)))
         check_graph(attractor, signature.attractor())
         check_graph(generator, signature.generator(state_size(generator)))
-        parsed = [read_metadata(session) for session in sessions]
+        parsed = [read_metadata(file) for file in files]
         if any(other != parsed[0] for other in parsed):
             ids = ", ".join(each.model_id for each in parsed)
             raise ModelError(
                 f"the encoder, attractor and generator in {folder} are of different models "
                 f"({ids}); export all three from one checkpoint"
             )
-        return cls(encoder, attractor, generator, parsed[0])
+        return cls(
+            open_session(encoder), open_session(attractor), open_session(generator), parsed[0]
+        )
 
     @property
     def model_id(self) -> str:
@@ -230,6 +240,8 @@ class Networks:
         return outputs
 
 
-def _zero_state(size: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    zeros = np.zeros((1, size), np.float32)
+def _zero_state(session: ort.InferenceSession) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """`h` and `c` (1, state) of a network before its first tick."""
+    (shape,) = (node.shape for node in session.get_inputs() if node.name == "h")
+    zeros = np.zeros(shape, np.float32)
     return zeros, zeros

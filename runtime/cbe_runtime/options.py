@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import math
+import re
 import tomllib
 from dataclasses import fields
 from pathlib import Path
@@ -20,6 +22,14 @@ from cbe_runtime.networks import PACKAGED_MODELS
 from cbe_runtime.route import AttractorPrecision, EmbeddingPrecision
 
 TABLES = ("camera", "follower")
+UNSTORED = ("help", "config")
+"""Options that mean nothing in a file."""
+
+MAX_TOML_BYTES = 2**16
+MAX_DOTS = 100
+"""In a line: time and memory for a key with many grow with their square."""
+MAX_INT = 2**63
+_KEY = re.compile("[A-Za-z][A-Za-z0-9_-]*")
 
 
 def add_link(parser: argparse.ArgumentParser) -> None:
@@ -128,6 +138,7 @@ def camera_of(values: dict[str, Any], path: Path) -> CameraModel:
     Raises:
         ConfigError: the values describe none.
     """
+    _require_table("camera", values, path)
     try:
         return CameraModel.from_dict(values)
     except CameraError as error:
@@ -140,10 +151,16 @@ def follower_config(values: dict[str, Any], path: Path) -> FollowerConfig:
     Raises:
         ConfigError: a key is unknown or a value out of range.
     """
+    _require_table("follower", values, path)
     known = [field.name for field in fields(FollowerConfig)]
     unknown = sorted(set(values) - set(known))
     if unknown:
-        raise ConfigError(f"{path}: [follower] has unknown {unknown}; known: {known}")
+        raise ConfigError(
+            f"{path}: [follower] has unknown {str(unknown)[:200]}; known: {', '.join(known)}"
+        )
+    for name, value in values.items():
+        if type(value) not in (int, float) or not 0 < value < MAX_INT:
+            raise ConfigError(f"{path}: {name} in [follower] must be a positive, finite number")
     try:
         return msgspec.convert(values, FollowerConfig)
     except msgspec.ValidationError as error:
@@ -154,14 +171,26 @@ def read_toml(path: Path) -> dict[str, Any]:
     """A TOML file's values.
 
     Raises:
-        ConfigError: it cannot be read or is no TOML.
+        ConfigError: it cannot be read, is too large or is no TOML.
     """
     try:
-        return tomllib.loads(path.read_text())
+        with path.open("rb") as file:
+            data = file.read(MAX_TOML_BYTES + 1)
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}; check the path") from error
-    except ValueError as error:  # no TOML, or no UTF-8
-        raise ConfigError(f"{path} is no TOML file: {error}") from error
+    if len(data) > MAX_TOML_BYTES:
+        raise ConfigError(f"{path} has more than {MAX_TOML_BYTES} bytes; is it a configuration?")
+    if any(line.count(b".") > MAX_DOTS for line in data.splitlines()):
+        raise ConfigError(f"{path} has a line with more than {MAX_DOTS} dots; split it")
+    try:
+        return tomllib.loads(data.decode())
+    except (ValueError, RecursionError) as error:  # no TOML, or no UTF-8
+        raise ConfigError(f"{path} is no TOML file: {str(error)[:200]}") from error
+
+
+def _require_table(name: str, values: object, path: Path) -> None:
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: {name} must be a table, [{name}]")
 
 
 def arguments_of(values: dict[str, Any], path: Path) -> list[str]:
@@ -174,13 +203,21 @@ def arguments_of(values: dict[str, Any], path: Path) -> list[str]:
     for key, value in values.items():
         if key in TABLES:
             continue
+        if key in UNSTORED or not _KEY.fullmatch(key):
+            raise ConfigError(f"{path}: {key[:40]!r} is no option that a file may hold")
         option = f"--{key.replace('_', '-')}"
+        many = value if isinstance(value, list) else [value]
         if value is True:
             arguments.append(option)
-        elif isinstance(value, (str, int, float)) and value is not False:
-            arguments.append(f"{option}={value}")
-        elif isinstance(value, list) and all(isinstance(each, str) for each in value):
-            arguments.extend(f"{option}={each}" for each in value)
         elif value is not False:
-            raise ConfigError(f"{path}: {key} = {value!r} is nothing that {option} takes")
+            if not all(_is_plain(each) for each in many):
+                raise ConfigError(f"{path}: {key} holds nothing that {option} takes")
+            arguments.extend(f"{option}={each}" for each in many)
     return arguments
+
+
+def _is_plain(value: object) -> bool:
+    """Whether a value could stand on a command line."""
+    if isinstance(value, str):
+        return value.isprintable()
+    return type(value) in (int, float) and math.isfinite(value) and abs(value) < MAX_INT

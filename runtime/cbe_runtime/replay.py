@@ -44,7 +44,7 @@ def decisions(follower: Follower, drive: RecordedDrive, robot: Robot) -> Iterato
                 ranges_m = resample(LaserScan.from_cdr(message.data), robot)
             except MessageError as error:
                 logger.warning("left out a scan: %s", error)
-        if message.topic != drive.topic:
+        if message.topic != drive.topic or message.type_name not in IMAGE_TYPES:
             continue
         image, stamp_ns = None, message.log_time_ns
         try:

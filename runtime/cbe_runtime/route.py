@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from cbe.errors import RouteError
 from cbe.signature import ATTRACTOR_SIZE, EMBEDDING_SIZE
+from cbe_runtime.likeness import ALIKE, unlikeness
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -157,6 +158,36 @@ class Route:
     def embedding(self, segment: int) -> NDArray[np.float32]:
         """Embedding z (32,) of a segment's demonstration."""
         return self.precision.embedding.unpack(self.segments[segment].embedding)
+
+    def join(self, other: Route) -> Route:
+        """This route and then the other, which must begin where this one ends.
+
+        The joint keeps the other's first attractor, so that the last segment leads to where the
+        other was taught from. Tags are merged; where both have one, this route's stays.
+
+        Raises:
+            RouteError: model, camera, precision or network period differ, or the places do.
+        """
+        for name in ("model_id", "network_period", "camera", "precision"):
+            mine, its = getattr(self, name), getattr(other, name)
+            if mine != its:
+                raise RouteError(
+                    f"the routes cannot be joined: their {name} differs ({mine} and {its}); teach "
+                    "both alike"
+                )
+        apart = float(unlikeness(self.attractor(len(self.segments)), other.attractor(0)))
+        if apart > ALIKE:
+            raise RouteError(
+                "the end of the first route does not look like the start of the second: they "
+                f"differ by {apart:.2f}, expected at most {ALIKE:.2f}; teach the second from where "
+                "the first ends, within 0.3 m and 15 deg"
+            )
+        return replace(
+            self,
+            attractors=self.attractors[:-1] + other.attractors,
+            segments=self.segments + other.segments,
+            tags={**other.tags, **self.tags},
+        )
 
     def require_model(self, networks: Networks) -> None:
         """Refuse to be repeated by networks other than those that taught it.

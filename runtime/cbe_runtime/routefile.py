@@ -11,7 +11,7 @@ import contextlib
 import hashlib
 import math
 import os
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import msgpack
 import msgspec
@@ -25,16 +25,17 @@ if TYPE_CHECKING:
 
 MAGIC = "cbe-route"
 VERSION = 1
-MAX_FILE_BYTES = 64 * 2**20
+MAX_FILE_BYTES = 8 * 2**20
+"""Days of driving; read, checked and taken apart it stays within a board's memory."""
 MAX_SEGMENTS = 100_000
-
-_SHORT = 256  # longest string in a file
+MAX_TAGS = 64
 
 Checked = TypeVar("Checked")
+_Text = Annotated[str, msgspec.Meta(max_length=256)]
 
 
 class _Envelope(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    magic: str
+    magic: _Text
     version: int
     sha256: Annotated[bytes, msgspec.Meta(min_length=32, max_length=32)]
     body: bytes
@@ -52,7 +53,7 @@ class _Camera(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_field
     fy: float
     cx: float
     cy: float
-    model: str
+    model: _Text
     distortion: Annotated[tuple[float, ...], msgspec.Meta(max_length=16)]
 
 
@@ -77,7 +78,7 @@ class _Body(
     precision: tuple[AttractorPrecision, EmbeddingPrecision]
     attractors: bytes
     segments: Annotated[tuple[_Segment, ...], msgspec.Meta(min_length=1, max_length=MAX_SEGMENTS)]
-    tags: dict[str, str] = {}
+    tags: Annotated[dict[_Text, _Text], msgspec.Meta(max_length=MAX_TAGS)] = {}
 
 
 def dump(route: Route) -> bytes:
@@ -120,7 +121,7 @@ def parse(data: bytes) -> Route:
     Raises:
         RouteError: the bytes are no route, damaged, of another version or out of range.
     """
-    envelope = _convert(_unpack(data, max_bin_len=MAX_FILE_BYTES), _Envelope)
+    envelope = _decode(data, _Envelope)
     if envelope.magic != MAGIC:
         raise RouteError(
             f"the file is no route: its magic is {envelope.magic!r}, expected {MAGIC!r}"
@@ -134,7 +135,7 @@ def parse(data: bytes) -> Route:
         raise RouteError(
             "the route file is damaged: its sha256 does not match; copy or teach it again"
         )
-    body = _convert(_unpack(envelope.body, max_bin_len=MAX_FILE_BYTES), _Body)
+    body = _decode(envelope.body, _Body)
     precision = Precision(*body.precision)
     size = precision.attractor.size_bytes
     if len(body.attractors) != size * (len(body.segments) + 1):
@@ -205,29 +206,17 @@ def save(route: Route, path: Path) -> int:
     return len(data)
 
 
-def _unpack(data: bytes, *, max_bin_len: int) -> Any:
+def _decode(data: bytes, into: type[Checked]) -> Checked:
+    """Decode straight into a type: what it does not hold is refused before anything is built."""
     try:
-        return msgpack.unpackb(
-            data,
-            max_bin_len=max_bin_len,
-            max_str_len=_SHORT,
-            max_array_len=MAX_SEGMENTS,
-            max_map_len=_SHORT,
-            max_ext_len=0,
-        )
-    except (ValueError, msgpack.UnpackException) as error:
-        raise RouteError(
-            f"the route file is truncated or no MessagePack ({error or type(error).__name__}); "
-            "copy or teach it again"
-        ) from error
-
-
-def _convert(unpacked: Any, into: type[Checked]) -> Checked:
-    try:
-        return msgspec.convert(unpacked, into)
+        return msgspec.msgpack.decode(data, type=into)
     except msgspec.ValidationError as error:
         raise RouteError(
             f"the route file does not hold a route ({error}); teach it again"
+        ) from error
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:
+        raise RouteError(
+            f"the route file is truncated or no MessagePack ({error}); copy or teach it again"
         ) from error
 
 

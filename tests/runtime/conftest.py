@@ -126,6 +126,23 @@ def make_model(folder, ticks_to_goal=19.5, waypoint_m=(0.5, 0.0), **metadata):
     return folder
 
 
+def write_shape(folder, path_m, **metadata):
+    """Write a shape.onnx that reads the same path (8, 2) off every embedding."""
+    weights = {"zero": np.float32([0.0]), "path": np.float32(path_m)[None]}
+    nodes = [
+        helper.make_node("ReduceMean", ["embedding"], ["mean"], axes=[0, 1], keepdims=0),
+        helper.make_node("Mul", ["mean", "zero"], ["nothing"]),
+        helper.make_node("Add", ["path", "nothing"], ["path_m"]),
+    ]
+    write(folder, signature.shape(), nodes, weights, **metadata)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def shape_writer():
+    return write_shape
+
+
 @pytest.fixture(scope="session")
 def model_folder(tmp_path_factory) -> Path:
     return make_model(tmp_path_factory.mktemp("model"))
