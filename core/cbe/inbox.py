@@ -87,7 +87,8 @@ class Latest(Generic[T]):
         try:
             message = self._decode(sample.payload)
         except MessageError as malformed:
-            error = malformed
+            # Its frames would hold the payload, and through this one themselves.
+            error = malformed.with_traceback(None)
         received = Received(message, error, sample.received_s, sample.count)
         with self._arrived:
             self._malformed += error is not None

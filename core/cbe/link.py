@@ -27,6 +27,8 @@ logger = logging.getLogger(__name__)
 T = TypeVar("T")
 JsonObject = dict[str, Any]
 
+MAX_JSON_BYTES = 2**16
+"""Of a call or a status: ours have about a thousand; objects take many times that to unpack."""
 RETRY_S = 0.05  # between two tries to reach a process that may be starting
 _ATTACHMENT = struct.Struct("<qqB16s")
 """rmw_zenoh's: sequence number, time sent in ns, length of the writer's id, that id."""
@@ -234,9 +236,11 @@ def _cdr(message: Message) -> bytes:
 
 
 def _from_json(payload: bytes) -> JsonObject:
+    if len(payload) > MAX_JSON_BYTES:
+        raise MessageError(f"{len(payload)} bytes of JSON are more than {MAX_JSON_BYTES}")
     try:
         return msgspec.json.decode(payload, type=JsonObject)
-    except (msgspec.MsgspecError, RecursionError) as error:
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise MessageError(f"{len(payload)} bytes are no JSON object: {error}") from error
 
 

@@ -41,7 +41,11 @@ class TlsConfig:
         Raises:
             ConfigError: there is no such folder.
         """
-        if not folder.is_dir():
+        try:
+            found = folder.is_dir()
+        except OSError:  # a name too long
+            found = False
+        if not found:
             raise ConfigError(f"no folder {folder}; make the certificates in it with cbe-keys")
         certificate: Path | None = folder / CERTIFICATE
         key: Path | None = folder / KEY

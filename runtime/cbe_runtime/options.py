@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import re
 import tomllib
 from dataclasses import fields
@@ -26,8 +25,10 @@ UNSTORED = ("help", "config")
 """Options that mean nothing in a file."""
 
 MAX_TOML_BYTES = 2**16
-MAX_DOTS = 100
+MAX_DOTS = 30
 """In a line: time and memory for a key with many grow with their square."""
+MAX_ARGUMENTS = 200
+MAX_VALUE = 1_000
 MAX_INT = 2**63
 _KEY = re.compile("[A-Za-z][A-Za-z0-9_-]*")
 
@@ -213,11 +214,15 @@ def arguments_of(values: dict[str, Any], path: Path) -> list[str]:
             if not all(_is_plain(each) for each in many):
                 raise ConfigError(f"{path}: {key} holds nothing that {option} takes")
             arguments.extend(f"{option}={each}" for each in many)
+    if len(arguments) > MAX_ARGUMENTS:
+        raise ConfigError(f"{path} has {len(arguments)} values; expected {MAX_ARGUMENTS} at most")
     return arguments
 
 
 def _is_plain(value: object) -> bool:
     """Whether a value could stand on a command line."""
     if isinstance(value, str):
-        return value.isprintable()
-    return type(value) in (int, float) and math.isfinite(value) and abs(value) < MAX_INT
+        return len(value) <= MAX_VALUE and value.isprintable()
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return -MAX_INT < value < MAX_INT  # nor NaN

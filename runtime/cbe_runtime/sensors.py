@@ -85,7 +85,7 @@ class Sensors:
             try:
                 return Frame(self._view(message), received.received_s, message.stamp_ns)
             except (MessageError, CameraError) as unusable:
-                error = unusable
+                error = unusable.with_traceback(None)  # its frames hold the message
         self._complain(error)
         # Every unreadable message counts as a new one, so that it is named bad and not frozen.
         return Frame(None, received.received_s, -received.count)
@@ -97,7 +97,7 @@ class Sensors:
                 ranges_m = resample(message, self._robot)
                 return Scan(ranges_m, received.received_s, message.stamp_ns)
             except MessageError as unusable:
-                error = unusable
+                error = unusable.with_traceback(None)
         self._complain(error)
         return Scan(None, received.received_s, -received.count)
 

@@ -32,7 +32,7 @@ class View:
     def __init__(self, camera: CameraModel | None = None) -> None:
         self._given = camera
         self._info: CameraInfo | None = None
-        self._refusal: CameraError | None = None
+        self._refusal: str | None = None
         self._preprocessor = None if camera is None else _preprocessor(camera)
 
     @property
@@ -62,7 +62,7 @@ class View:
             self._preprocessor = _preprocessor(camera)
         except CameraError as refusal:
             # A camera known to be unusable must not fall back to the assumed view.
-            self._refusal = refusal
+            self._refusal = str(refusal)
             raise
 
     def __call__(self, message: CompressedImage | Image) -> NDArray[np.uint8]:
@@ -73,7 +73,7 @@ class View:
             CameraError: it does not fit the calibration, or there is none.
         """
         if self._refusal is not None:
-            raise self._refusal
+            raise CameraError(self._refusal)
         image = decode_image(message)
         if self._preprocessor is None:
             self._preprocessor = _assumed(width=image.shape[1], height=image.shape[0])
