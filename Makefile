@@ -6,7 +6,7 @@ PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -c const
 option = $(if $(filter-out 0,$($(1))),$(2))
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test check format train export bench clean
+.PHONY: help install demo test soak check format train export bench clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -20,6 +20,9 @@ demo: $(VENV)/.demo ## teach once and repeat in simulation (SEED=n SCENE=dir OBS
 
 test: $(VENV)/.all ## run the tests (ARGS="-k name" narrows)
 	$(BIN)/python -m pytest -n 2 --dist loadgroup $(ARGS)
+
+soak: $(VENV)/.all ## feed hostile files and messages, 200000 of each kind (INPUTS=n SEED=n)
+	CBE_FUZZ_INPUTS=$(or $(INPUTS),200000) CBE_FUZZ_SEED=$(or $(SEED),0) $(BIN)/python -m pytest tests/fuzz -n 2 --timeout 14400 $(ARGS)
 
 check: $(VENV)/.all ## lint, format check, types and the rooms' import rules
 	$(BIN)/ruff check

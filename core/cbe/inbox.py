@@ -15,6 +15,9 @@ from cbe.errors import MessageError
 
 T = TypeVar("T")
 
+MAX_STREAM_BYTES = 32 * 2**20
+"""Of messages that wait for a recorder: some seconds of raw images, a minute of compressed ones."""
+
 
 @dataclass(frozen=True, slots=True)
 class Sample:
@@ -87,8 +90,8 @@ class Latest(Generic[T]):
         try:
             message = self._decode(sample.payload)
         except MessageError as malformed:
-            # Its frames would hold the payload, and through this one themselves.
-            error = malformed.with_traceback(None)
+            # A copy: the caught one's frames hold this call's, which holds the message before.
+            error = MessageError(str(malformed))
         received = Received(message, error, sample.received_s, sample.count)
         with self._arrived:
             self._malformed += error is not None
@@ -120,8 +123,9 @@ class Stream:
     def __init__(self, capacity: int, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._arrived = threading.Condition()
-        self._samples: deque[Sample] = deque(maxlen=capacity)
-        self._count = self._dropped = 0
+        self._capacity = capacity
+        self._samples: deque[Sample] = deque()
+        self._count = self._bytes = self._dropped = 0
 
     def store(self, payload: bytes, sequence: int | None = None) -> None:
         """Called by the link's thread."""
@@ -129,8 +133,11 @@ class Stream:
         received_s = self._clock()
         with self._arrived:
             self._count += 1
-            self._dropped += len(self._samples) == self._samples.maxlen
+            self._bytes += len(payload)
             self._samples.append(Sample(payload, received_s, self._count))
+            while len(self._samples) > self._capacity or self._bytes > MAX_STREAM_BYTES:
+                self._bytes -= len(self._samples.popleft().payload)
+                self._dropped += 1
             self._arrived.notify_all()
 
     def drain(self, timeout_s: float = 0.0) -> list[Sample]:
@@ -139,6 +146,7 @@ class Stream:
             self._arrived.wait_for(lambda: bool(self._samples), timeout_s)
             samples = list(self._samples)
             self._samples.clear()
+            self._bytes = 0
         return samples
 
     @property

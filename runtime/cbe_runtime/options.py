@@ -25,7 +25,7 @@ UNSTORED = ("help", "config")
 """Options that mean nothing in a file."""
 
 MAX_TOML_BYTES = 2**16
-MAX_DOTS = 30
+MAX_DOTS = 100
 """In a line: time and memory for a key with many grow with their square."""
 MAX_ARGUMENTS = 200
 MAX_VALUE = 1_000

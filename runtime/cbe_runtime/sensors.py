@@ -80,25 +80,25 @@ class Sensors:
             self._complain(error)
 
     def _framed(self, received: Received[Any]) -> Frame:
-        message, error = received.message, _unread(received)
-        if message is not None:
-            try:
+        message = received.message
+        try:
+            if message is not None:
                 return Frame(self._view(message), received.received_s, message.stamp_ns)
-            except (MessageError, CameraError) as unusable:
-                error = unusable.with_traceback(None)  # its frames hold the message
-        self._complain(error)
+            self._complain(received.error)
+        except (MessageError, CameraError) as unusable:
+            self._complain(unusable)
         # Every unreadable message counts as a new one, so that it is named bad and not frozen.
         return Frame(None, received.received_s, -received.count)
 
     def _scanned(self, received: Received[LaserScan]) -> Scan:
-        message, error = received.message, _unread(received)
-        if message is not None:
-            try:
+        message = received.message
+        try:
+            if message is not None:
                 ranges_m = resample(message, self._robot)
                 return Scan(ranges_m, received.received_s, message.stamp_ns)
-            except MessageError as unusable:
-                error = unusable.with_traceback(None)
-        self._complain(error)
+            self._complain(received.error)
+        except MessageError as unusable:
+            self._complain(unusable)
         return Scan(None, received.received_s, -received.count)
 
     def _complain(self, error: CbeError | None) -> None:
@@ -107,8 +107,3 @@ class Sensors:
         if complaint != self._complaint:
             logger.warning("%s", complaint)
         self._complaint = complaint
-
-
-def _unread(received: Received[Any]) -> CbeError | None:
-    """The reason why a message has no content, as the base of what else may go wrong."""
-    return received.error
