@@ -18,8 +18,7 @@ from cbe.camera import MODEL_CAMERA
 from cbe.errors import ModelError
 from cbe_export.graphs import ticks
 from cbe_export.parity import Rides, worst_difference
-from cbe_training.checkpoint import load_heads, load_networks
-from cbe_training.losses import AuxiliaryHeads
+from cbe_training.checkpoint import load_networks
 from cbe_training.networks import BehaviorNetworks
 
 TOLERANCE = 1e-4
@@ -43,20 +42,19 @@ class Exported:
 def export(
     checkpoint: Path, folder: Path, *, network_period: int, segment_steps: int, cache: Path
 ) -> Exported:
-    """Export the checkpoint's averaged networks, and the head that reads paths, to `folder`.
+    """Export the checkpoint's averaged networks to `folder`.
 
     Raises ModelError, writing nothing, if onnxruntime differs from torch by more than 1e-4
     anywhere in at least 200 ticks of real rollouts.
     """
     networks = load_networks(checkpoint).half().float()  # stored in half precision
-    heads = load_heads(checkpoint).half().float()
     rides = Rides.record(networks, cache)
     with tempfile.TemporaryDirectory() as scratch:
         staging = Path(scratch)
         model_id = write_graphs(
-            networks, heads, staging, network_period=network_period, segment_steps=segment_steps
+            networks, staging, network_period=network_period, segment_steps=segment_steps
         )
-        worst, count = worst_difference(networks, heads, staging, rides)
+        worst, count = worst_difference(networks, staging, rides)
         if not worst <= TOLERANCE or count < LEAST_TICKS:
             raise ModelError(
                 f"onnxruntime differs from torch by {worst:.2g} over {count} ticks; expected at "
@@ -89,16 +87,12 @@ def _camera() -> str:
 
 def write_graphs(
     networks: BehaviorNetworks,
-    heads: AuxiliaryHeads,
     folder: Path,
     *,
     network_period: int,
     segment_steps: int,
 ) -> str:
-    """Write a file for each graph of `cbe.signature`; returns the model id.
-
-    The heads are no part of what is identified: they change nothing about how a route is driven.
-    """
+    """Write a file for each graph of `cbe.signature`; returns the model id."""
     model_id = identify(networks)
     values = (
         str(signature.CONTRACT_VERSION),
@@ -109,7 +103,7 @@ def write_graphs(
         "fp32",
     )
     metadata = dict(zip(signature.METADATA_KEYS, values, strict=True))
-    for graph, module in ticks(networks, heads):
+    for graph, module in ticks(networks):
         path = folder / f"{graph.name}.onnx"
         inputs = tuple(
             torch.zeros(t.shape, dtype=torch.uint8 if "uint8" in t.dtype else torch.float32)

@@ -4,10 +4,11 @@ import torch
 from torch import Tensor, nn
 
 from cbe import signature
-from cbe_training.losses import AuxiliaryHeads
-from cbe_training.networks import STEP_SCALE, BehaviorNetworks, add_up, place
+from cbe_training import path
+from cbe_training.layout import path_of
+from cbe_training.networks import BehaviorNetworks
 
-POSE = 3
+PATH = 3 + 2 * path.DEGREES + 1  # numbers of a `path.Path`
 
 
 class LstmCell(nn.Module):
@@ -29,15 +30,13 @@ class LstmCell(nn.Module):
 
 
 class EncoderTick(nn.Module):
-    """Graph `encoder`; the dead-reckoned pose travels as the last three numbers of `h`."""
+    """Graph `encoder`; the path travels as the last numbers of `h`."""
 
     def __init__(self, networks: BehaviorNetworks) -> None:
         super().__init__()
         self.trunk = networks.trunk
-        self.pair = networks.encoder.pair
+        self.encoder = networks.encoder
         self.lstm = LstmCell(networks.encoder.lstm)
-        self.odometry = networks.encoder.odometry
-        self.to_embedding = networks.encoder.to_embedding
 
     def forward(
         self, image: Tensor, previous_features: Tensor, is_first: Tensor, h: Tensor, c: Tensor
@@ -48,14 +47,20 @@ class EncoderTick(nn.Module):
         previous = first * features + (1.0 - first) * previous_features
         # A new behavior starts from nothing, whatever state was passed in.
         h, c = (1.0 - is_first) * h, (1.0 - is_first) * c
-        h, pose = h.split([h.shape[1] - POSE, POSE], dim=1)
-        c, spare = c.split([c.shape[1] - POSE, POSE], dim=1)
-        motion = self.pair(features, previous)
-        step = (1.0 - is_first) * self.odometry(motion) / STEP_SCALE
-        pose = add_up(step[:, None], pose)[:, 0]
-        h, c = self.lstm(torch.cat([motion, place(pose)], dim=1), h, c)
-        embedding = self.to_embedding(torch.cat([h, place(pose)], dim=1))
-        return features, embedding, torch.cat([h, pose], dim=1), torch.cat([c, spare], dim=1)
+        h, packed = h.split([h.shape[1] - PATH, PATH], dim=1)
+        c, spare = c.split([c.shape[1] - PATH, PATH], dim=1)
+        motion = self.encoder.pair(features, previous)
+        step = (1.0 - is_first) * self.encoder.step(motion)
+        after = path.advance(_unpack(packed), step)
+        h, c = self.lstm(torch.cat([motion, path.place(after.pose)], dim=1), h, c)
+        embedding = self.encoder.embed(h, after.pose, after.series)
+        packed = torch.cat([after.pose, after.series.flatten(1), after.frames], dim=1)
+        return features, embedding, torch.cat([h, packed], dim=1), torch.cat([c, spare], dim=1)
+
+
+def _unpack(packed: Tensor) -> path.Path:
+    pose, series, frames = packed.split([3, 2 * path.DEGREES, 1], dim=1)
+    return path.Path(pose, series.view(1, 2, path.DEGREES), frames)
 
 
 class AttractorTick(nn.Module):
@@ -75,12 +80,8 @@ class GeneratorTick(nn.Module):
 
     def __init__(self, networks: BehaviorNetworks) -> None:
         super().__init__()
-        generator = networks.generator
-        self.relation = generator.relation
-        self.behavior = generator.behavior
-        self.lstm = LstmCell(generator.lstm)
-        self.head = generator.head
-        self.out = generator.out
+        self.generator = networks.generator
+        self.lstm = LstmCell(networks.generator.lstm)
 
     def forward(
         self,
@@ -96,39 +97,31 @@ class GeneratorTick(nn.Module):
         """See `cbe.signature.generator`."""
         now = torch.cat([attractor_now, attractor_first])
         target = torch.cat([attractor_goal, attractor_start])
-        relations = self.relation(now, target).reshape(1, -1)  # (1, 2 * relation), goal first
-        behavior = self.behavior(torch.cat([embedding_now, embedding_goal], dim=1))
-        inputs = torch.cat([relations, behavior], dim=1)
+        to_goal, to_start = self.generator.relation(now, target).split(1)
+        inputs = self.generator.gather(to_goal, to_start, embedding_now, embedding_goal)
         h, c = self.lstm(inputs, h, c)
-        out = self.out(self.head(torch.cat([h, inputs], dim=1)))  # (1, 4)
+        out = self.generator.out(self.generator.head(torch.cat([h, inputs], dim=1)))  # (1, 4)
         return out[:, :2], out[:, 2], torch.sigmoid(out[:, 3]), h, c
 
 
 class ShapeTick(nn.Module):
     """Graph `shape`."""
 
-    def __init__(self, heads: AuxiliaryHeads) -> None:
-        super().__init__()
-        self.shape = heads.shape
-
     def forward(self, embedding: Tensor) -> Tensor:
         """See `cbe.signature.shape`."""
-        return self.shape(embedding).view(1, signature.SHAPE_POINTS, 2)
+        return path_of(embedding, signature.SHAPE_POINTS)
 
 
 def encoder_signature(networks: BehaviorNetworks) -> signature.Graph:
-    """Tensors of the encoder: its state is the LSTM's and the pose."""
-    return signature.encoder(networks.config.encoder_state + POSE)
+    """Tensors of the encoder: its state is the LSTM's and the path."""
+    return signature.encoder(networks.config.encoder_state + PATH)
 
 
-def ticks(
-    networks: BehaviorNetworks, heads: AuxiliaryHeads
-) -> list[tuple[signature.Graph, nn.Module]]:
+def ticks(networks: BehaviorNetworks) -> list[tuple[signature.Graph, nn.Module]]:
     """All graphs with the modules that compute them."""
-    config = networks.config
     return [
         (encoder_signature(networks), EncoderTick(networks)),
         (signature.attractor(), AttractorTick(networks)),
-        (signature.generator(config.generator_state), GeneratorTick(networks)),
-        (signature.shape(), ShapeTick(heads)),
+        (signature.generator(networks.config.generator_state), GeneratorTick(networks)),
+        (signature.shape(), ShapeTick()),
     ]

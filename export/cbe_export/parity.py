@@ -13,7 +13,7 @@ from cbe import signature
 from cbe_export.graphs import encoder_signature
 from cbe_training.config import TrainConfig
 from cbe_training.drives import unseen
-from cbe_training.losses import AuxiliaryHeads
+from cbe_training.layout import path_of
 from cbe_training.networks import BehaviorNetworks
 from cbe_training.rollout import roll_out, show
 
@@ -42,9 +42,7 @@ class Rides:
         return cls(done.images, done.frames, behaviors.images[done.shown])
 
 
-def worst_difference(
-    networks: BehaviorNetworks, heads: AuxiliaryHeads, folder: Path, rides: Rides
-) -> tuple[float, int]:
+def worst_difference(networks: BehaviorNetworks, folder: Path, rides: Rides) -> tuple[float, int]:
     """Largest difference of any generator, encoder or shape output, and over how many ticks."""
     sessions = {
         name: onnxruntime.InferenceSession(
@@ -54,7 +52,7 @@ def worst_difference(
     }
     worst, ticks = 0.0, 0
     for images, frames, shown in zip(rides.images, rides.frames, rides.shown, strict=True):
-        expected = _run_torch(networks, heads, images[:frames], shown)
+        expected = _run_torch(networks, images[:frames], shown)
         found = _run_onnx(networks, sessions, images[:frames], shown)
         worst = max(worst, float(np.abs(expected - found).max()))
         ticks += int(frames)
@@ -64,7 +62,6 @@ def worst_difference(
 @torch.no_grad()
 def _run_torch(
     networks: BehaviorNetworks,
-    heads: AuxiliaryHeads,
     images: NDArray[np.uint8],
     shown: NDArray[np.uint8],
 ) -> NDArray[np.float32]:
@@ -82,7 +79,8 @@ def _run_torch(
     to_start = relation(attractor[:1], goal[:1])[None].expand(1, steps, -1)
     out = networks.generator(to_goal, to_start, z, goal_z[:, -1:].expand(1, steps, -1))
     parts = [out.waypoint_m, out.progress[..., None], torch.sigmoid(out.on_route_logit)[..., None]]
-    return torch.cat([*parts, z, heads.shape(z)], dim=-1)[0].numpy()
+    paths = path_of(z, signature.SHAPE_POINTS).flatten(-2)
+    return torch.cat([*parts, z, paths], dim=-1)[0].numpy()
 
 
 def _run_onnx(

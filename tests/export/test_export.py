@@ -14,7 +14,7 @@ from cbe_export.export import identify, write_graphs
 from cbe_export.parity import Rides, worst_difference
 from cbe_runtime.networks import Networks
 from cbe_runtime.pathshape import PathShape
-from cbe_training.losses import AuxiliaryHeads
+from cbe_training.layout import path_of
 from cbe_training.networks import BehaviorNetworks
 
 
@@ -25,17 +25,9 @@ def networks() -> BehaviorNetworks:
 
 
 @pytest.fixture(scope="module")
-def heads(networks: BehaviorNetworks) -> AuxiliaryHeads:
-    torch.manual_seed(4)
-    return AuxiliaryHeads(networks.config).eval()
-
-
-@pytest.fixture(scope="module")
-def folder(
-    networks: BehaviorNetworks, heads: AuxiliaryHeads, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
+def folder(networks: BehaviorNetworks, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("models")
-    write_graphs(networks, heads, folder, network_period=2, segment_steps=100)
+    write_graphs(networks, folder, network_period=2, segment_steps=100)
     return folder
 
 
@@ -60,35 +52,28 @@ def test_every_graph_carries_all_metadata(folder: Path) -> None:
 
 
 def test_onnxruntime_agrees_with_torch_through_the_recurrence(
-    networks: BehaviorNetworks, heads: AuxiliaryHeads, folder: Path, rides: Rides
+    networks: BehaviorNetworks, folder: Path, rides: Rides
 ) -> None:
-    worst, ticks = worst_difference(networks, heads, folder, rides)
+    worst, ticks = worst_difference(networks, folder, rides)
     assert ticks == 11
     assert worst < 1e-4
 
 
 def test_parity_notices_a_changed_weight(
-    networks: BehaviorNetworks, heads: AuxiliaryHeads, folder: Path, rides: Rides
+    networks: BehaviorNetworks, folder: Path, rides: Rides
 ) -> None:
     other = BehaviorNetworks().eval()
     other.load_state_dict(networks.state_dict())
     with torch.no_grad():
         other.encoder.lstm.weight_hh_l0[0] += 0.5
-    worst, _ = worst_difference(other, heads, folder, rides)
+    worst, _ = worst_difference(other, folder, rides)
     assert worst > 1e-4
 
 
-def test_parity_notices_another_shape_head(
-    networks: BehaviorNetworks, folder: Path, rides: Rides
-) -> None:
-    worst, _ = worst_difference(networks, AuxiliaryHeads(networks.config).eval(), folder, rides)
-    assert worst > 1e-4
-
-
-def test_runtime_reads_the_path_that_torch_does(heads: AuxiliaryHeads, folder: Path) -> None:
+def test_runtime_reads_the_path_that_torch_does(folder: Path) -> None:
     embedding = np.random.default_rng(0).normal(size=signature.EMBEDDING_SIZE).astype(np.float32)
     with torch.no_grad():
-        expected = heads.shape(torch.from_numpy(embedding)).view(-1, 2).numpy()
+        expected = path_of(torch.from_numpy(embedding), signature.SHAPE_POINTS).numpy()
     np.testing.assert_allclose(PathShape.load(folder).read(embedding), expected, atol=1e-5)
 
 
@@ -104,13 +89,11 @@ def test_model_id_follows_the_weights(networks: BehaviorNetworks, folder: Path) 
 
 def test_failed_parity_writes_nothing(
     networks: BehaviorNetworks,
-    heads: AuxiliaryHeads,
     rides: Rides,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(export_module, "load_networks", lambda _: networks)
-    monkeypatch.setattr(export_module, "load_heads", lambda _: heads)
     monkeypatch.setattr(Rides, "record", lambda networks, cache: rides)
     monkeypatch.setattr(export_module, "write_graphs", lambda *_, **__: "0" * 16)
     monkeypatch.setattr(export_module, "worst_difference", lambda *_: (2e-4, 300))

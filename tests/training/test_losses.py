@@ -8,7 +8,7 @@ import torch
 
 from cbe_training.config import TrainConfig
 from cbe_training.drives import Drives
-from cbe_training.losses import AuxiliaryHeads, Minibatch, compute
+from cbe_training.losses import Minibatch, compute
 from cbe_training.networks import BehaviorNetworks
 from cbe_training.rollout import roll_out, show
 
@@ -19,7 +19,6 @@ def test_kept_features_give_the_same_losses(tmp_path_factory: pytest.TempPathFac
     torch.manual_seed(0)
     drives = Drives.build(range(2), 6, tmp_path_factory.mktemp("drives"))
     networks = BehaviorNetworks()
-    heads = AuxiliaryHeads(networks.config)
     rng = np.random.default_rng(0)
     behaviors = show(drives, 4, 8, 2, rng)
     rollouts = roll_out(networks, drives, behaviors, CONFIG, rng, expert_share=0.5)
@@ -36,6 +35,6 @@ def test_kept_features_give_the_same_losses(tmp_path_factory: pytest.TempPathFac
             torch.device("cpu"),
             look_again=look_again,
         )
-        losses.append(compute(networks, heads, batch, CONFIG.loss)[1])
+        losses.append(compute(networks, batch, CONFIG.loss)[1])
     assert losses[0] == pytest.approx(losses[1], rel=1e-4)
     assert losses[0]["waypoint"] > 0.0

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from cbe import geometry, signature
-from cbe_training.networks import BehaviorNetworks, add_up, place, quantise
+from cbe import signature
+from cbe_training.networks import BehaviorNetworks, quantise
 from cbe_training.policy import Policy, memorise
 
 
@@ -23,8 +23,8 @@ def test_embedding_of_a_sequence_equals_that_of_single_ticks(networks: BehaviorN
     for tick in range(5):
         policy.tick(rows, images[:, tick])
     with torch.no_grad():
-        state = torch.cat([policy._encoder[0], place(policy._pose)], dim=-1)
-        last = networks.encoder.to_embedding(state)
+        path = policy._path
+        last = networks.encoder.embed(policy._encoder[0], path.pose, path.series)
     np.testing.assert_allclose(last.numpy(), memory.embedding.numpy(), atol=1e-5)
 
 
@@ -65,15 +65,3 @@ def test_quantise_rounds_the_value_and_passes_the_gradient() -> None:
     scaled = rounded[2] * 15.0
     torch.testing.assert_close(scaled, scaled.round())
     assert (rounded[1] - attractor[1]).abs().max() <= 0.5 / 255.0 + 1e-6
-
-
-def test_steps_add_up_to_the_pose_they_lead_to() -> None:
-    rng = np.random.default_rng(2)
-    steps = rng.normal(0.0, 0.3, (2, 6, 3))
-    pose = rng.normal(0.0, 1.0, (2, 3))
-    added = add_up(torch.from_numpy(steps), torch.from_numpy(pose)).numpy()
-    for tick in range(6):
-        pose = geometry.compose(pose, steps[:, tick])
-        turned = geometry.wrap_angle(added[:, tick, 2] - pose[:, 2])
-        np.testing.assert_allclose(added[:, tick, :2], pose[:, :2], atol=1e-12)
-        np.testing.assert_allclose(turned, 0.0, atol=1e-12)

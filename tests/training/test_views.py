@@ -8,7 +8,6 @@ from cbe import geometry
 from cbe_training import losses, views
 from cbe_training.config import LossWeights
 from cbe_training.drives import Drives
-from cbe_training.losses import AuxiliaryHeads
 from cbe_training.networks import BehaviorNetworks
 
 
@@ -44,16 +43,13 @@ def test_same_draw_gives_same_views(drives: Drives) -> None:
 def test_networks_learn_to_relate_a_few_views(drives: Drives) -> None:
     torch.manual_seed(0)
     networks = BehaviorNetworks()
-    heads = AuxiliaryHeads(networks.config)
     drawn = views.draw(drives, 4, np.random.default_rng(1))
     steps = views.draw_steps(drives, 8, np.random.default_rng(4))
     weights = LossWeights()
-    optimizer = torch.optim.AdamW([*networks.parameters(), *heads.parameters()], lr=1e-3)
+    optimizer = torch.optim.AdamW(networks.parameters(), lr=1e-3)
     errors = []
     for _ in range(120):
-        error, parts = losses.relate(
-            networks, heads, drawn, steps, weights, np.random.default_rng(2)
-        )
+        error, parts = losses.relate(networks, drawn, steps, weights, np.random.default_rng(2))
         optimizer.zero_grad()
         error.backward()
         optimizer.step()

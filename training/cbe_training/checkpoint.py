@@ -11,7 +11,6 @@ from torch import Tensor
 
 from cbe.errors import ModelError
 from cbe_training.config import LossWeights, TrainConfig
-from cbe_training.losses import AuxiliaryHeads
 from cbe_training.networks import BehaviorNetworks, NetworkConfig
 
 logger = logging.getLogger(__name__)
@@ -31,29 +30,13 @@ def load_networks(folder: Path) -> BehaviorNetworks:
 
     Raises ModelError if the folder holds no checkpoint.
     """
-    config, weights = _stored(folder, "average.safetensors")
-    networks = BehaviorNetworks(config)
-    networks.load_state_dict(weights)
-    return networks.eval()
-
-
-def load_heads(folder: Path) -> AuxiliaryHeads:
-    """The auxiliary heads of a checkpoint folder.
-
-    Raises ModelError if the folder holds none.
-    """
-    config, weights = _stored(folder, "heads.safetensors")
-    heads = AuxiliaryHeads(config)
-    heads.load_state_dict(weights)
-    return heads.eval()
-
-
-def _stored(folder: Path, name: str) -> tuple[NetworkConfig, dict[str, Tensor]]:
-    for path in (folder / "state.json", folder / name):
+    for path in (folder / "state.json", folder / "average.safetensors"):
         if not path.is_file():
             raise ModelError(f"no checkpoint at {folder}: {path.name} is missing; run cbe-train")
     config = config_from_json((folder / "state.json").read_text()).network
-    return config, load_file(folder / name)
+    networks = BehaviorNetworks(config)
+    networks.load_state_dict(load_file(folder / "average.safetensors"))
+    return networks.eval()
 
 
 def pack(run: Path, folder: Path) -> None:
@@ -64,16 +47,15 @@ def pack(run: Path, folder: Path) -> None:
     """
     load_networks(run)
     folder.mkdir(parents=True, exist_ok=True)
-    for name in ("average.safetensors", "heads.safetensors"):
-        weights = {k: v.half() for k, v in load_file(run / name).items()}
-        _save(folder / name, weights)
+    weights = load_file(run / "average.safetensors")
+    _save(folder / "average.safetensors", {k: v.half() for k, v in weights.items()})
     for name in ("state.json", "log.csv", "curve.png"):
         if (run / name).is_file():
             (folder / name).write_bytes((run / name).read_bytes())
 
 
 class Learner:
-    """What changes while training: networks, heads, optimiser, moving average, iteration."""
+    """What changes while training: networks, optimiser, moving average, iteration."""
 
     def __init__(self, config: TrainConfig, device: torch.device, *, bf16: bool = False) -> None:
         torch.manual_seed(config.seed)
@@ -81,7 +63,6 @@ class Learner:
         self.device = device
         self.bf16 = bf16
         self.networks = BehaviorNetworks(config.network).to(device)
-        self.heads = AuxiliaryHeads(config.network).to(device)
         self.average = BehaviorNetworks(config.network).to(device)
         self.average.load_state_dict(self.networks.state_dict())
         self.optimizer = torch.optim.AdamW(
@@ -97,7 +78,7 @@ class Learner:
     @property
     def parameters(self) -> list[torch.nn.Parameter]:
         """Everything the optimiser moves."""
-        return [*self.networks.parameters(), *self.heads.parameters()]
+        return list(self.networks.parameters())
 
     def update_average(self) -> None:
         """Move the averaged weights towards the present ones."""
@@ -119,7 +100,6 @@ class Learner:
                 kept[str(index)] = values[name]
         _save(folder / "average.safetensors", self.average.state_dict())
         _save(folder / "networks.safetensors", self.networks.state_dict())
-        _save(folder / "heads.safetensors", self.heads.state_dict())
         for name, kept in moments.items():
             _save(folder / f"{name}.safetensors", kept)
         state = {
@@ -141,7 +121,6 @@ class Learner:
             networks = folder / "average.safetensors"
         self.networks.load_state_dict(load_file(networks))
         self.average.load_state_dict(load_file(folder / "average.safetensors"))
-        self.heads.load_state_dict(load_file(folder / "heads.safetensors"))
         state = json.loads((folder / "state.json").read_text())
         self.iteration, self.updates = state["iteration"], state["updates"]
         self.sequences, self.seconds = state["sequences"], state["seconds"]

@@ -22,8 +22,7 @@ class LossWeights:
     progress: float = 2.0
     on_route: float = 0.1
     motion: float = 1.0  # relative pose of consecutive frames
-    displacement: float = 0.5  # pose since the start, from every z
-    shape: float = 0.5  # the path's points, from the final z
+    displacement: float = 0.5  # pose since the start, in every z
     relation: float = 0.3  # relative pose of two views, from their attractors
     views: float = 0.5  # the same, of views that are not a rollout's
 
@@ -59,6 +58,7 @@ class TrainConfig:
     off_route_m: float = 1.0  # a rollout further off its demonstration ends
     jitter_m: float = 0.3
     jitter_rad: float = 0.2356  # 13.5 deg
+    longest_steps: int = 270  # of a behavior, at any gap between frames
     validation_every: int = 40
     network: NetworkConfig = field(default_factory=NetworkConfig)
     loss: LossWeights = field(default_factory=LossWeights)
@@ -69,7 +69,7 @@ class TrainConfig:
             return 12, 24
         if sequences < self.cloning_sequences + self.annealing_sequences:
             return 20, 40
-        return 28, 72
+        return 28, 132
 
     def expert_share(self, sequences: int) -> float:
         """Probability that a tick is driven by the expert's waypoint."""

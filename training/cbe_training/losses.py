@@ -1,37 +1,23 @@
-"""The end-to-end loss (paper, Sec. IV-A) and auxiliary heads that are dropped at export."""
+"""The end-to-end loss (paper, Sec. IV-A) and auxiliary ones on poses read inside."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
 from cbe import geometry, signature
 from cbe_training.config import LossWeights, TrainConfig
-from cbe_training.networks import STEP_SCALE, BehaviorNetworks, NetworkConfig, quantise
+from cbe_training.layout import pose_of
+from cbe_training.networks import STEP_SCALE, BehaviorNetworks, quantise
 from cbe_training.policy import Seen, look
 from cbe_training.rollout import Behaviors, Rollouts
 from cbe_training.views import GROUP, NOW, TARGET, Steps, Views
 
-SHAPE_POINTS = signature.SHAPE_POINTS
 LEVELS = (0, 255, 15, 15)  # attractors stored exactly, at 8 bits, at 4 bits
 OVERLAP_M, OVERLAP_RAD = 2.0, np.radians(60.0)  # beyond, two views share too little
-
-
-class AuxiliaryHeads(nn.Module):
-    """Read poses off the inner features; each is a short way for the gradient to what matters."""
-
-    def __init__(self, config: NetworkConfig) -> None:
-        super().__init__()
-        self.displacement = _perceptron(signature.EMBEDDING_SIZE, 4)
-        self.shape = _perceptron(signature.EMBEDDING_SIZE, 2 * SHAPE_POINTS)
-        self.relation = _perceptron(config.relation, 4)
-
-
-def _perceptron(inputs: int, outputs: int) -> nn.Sequential:
-    return nn.Sequential(nn.Linear(inputs, 128), nn.ReLU(), nn.Linear(128, outputs))
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +27,6 @@ class Minibatch:
     shown: Tensor | Seen  # (D, T, 64, 64, 3) uint8, or what was seen in them
     shown_motion: Tensor  # (D, T, 3) pose of each frame in the one before
     shown_displacement: Tensor  # (D, T, 4) x, y, cos, sin since the first frame
-    shape: Tensor  # (D, 16) points along the path, in the first frame's frame
     driven: Tensor | Seen  # (B, S, 64, 64, 3) uint8, or what was seen in them
     motion: Tensor  # (B, S, 3)
     displacement: Tensor  # (B, S, 4)
@@ -78,10 +63,6 @@ class Minibatch:
         poses = rollouts.poses[chosen, :longest]
         valid = np.arange(longest) < rollouts.frames[chosen, None]
         frame_poses = behaviors.frame_poses[shown]
-        first = behaviors.paths.poses[shown, 0]
-        share = np.linspace(0, behaviors.paths.poses.shape[1] - 1, SHAPE_POINTS + 1)[1:]
-        points = behaviors.paths.poses[shown][:, share.round().astype(int), :2]
-        shape = geometry.to_frame(first[:, None], points)  # (D, 8, 2)
         goal = geometry.relative(poses, rollouts.goals[chosen][:, None])
         start = geometry.relative(poses[:, 0], rollouts.starts[chosen])
 
@@ -104,7 +85,6 @@ class Minibatch:
             shown=shown_seen,
             shown_motion=tensor(_motion(frame_poses)),
             shown_displacement=tensor(_vector(geometry.relative(frame_poses[:, :1], frame_poses))),
-            shape=tensor(shape.reshape(len(shown), -1)),
             driven=seen,
             motion=tensor(_motion(poses)),
             displacement=tensor(_vector(geometry.relative(poses[:, :1], poses))),
@@ -123,10 +103,9 @@ class Minibatch:
 
 
 def compute(
-    networks: BehaviorNetworks, heads: AuxiliaryHeads, batch: Minibatch, weights: LossWeights
+    networks: BehaviorNetworks, batch: Minibatch, weights: LossWeights
 ) -> tuple[Tensor, dict[str, float]]:
     """Weighted loss and its parts."""
-    shown = len(batch.shown_motion)
     count, longest = batch.valid.shape
     shown_motion, shown_ends = _seen(networks, batch.shown, every=False)
     motion, attractors = _seen(networks, batch.driven, every=True)
@@ -136,12 +115,12 @@ def compute(
     goal_z = shown_z[:, -1]
     # The memory is stored in few bits: half precision noise on z, coarse attractors.
     goal_z = goal_z + 0.01 * torch.randn_like(goal_z)
-    ends = quantise(shown_ends.flatten(1), batch.levels).view(shown, 2, -1)
+    ends = quantise(shown_ends.flatten(1), batch.levels).unflatten(1, (2, -1))
     # No attractor and no z is ever all zeros: that says there is none.
     goal_z = (goal_z * batch.keep_embedding)[batch.memory]
     ends = (ends * batch.keep_attractors[..., None])[batch.memory]
 
-    relation = networks.generator.relation
+    relation, locate = networks.generator.relation, networks.generator.guide.locate
     goal_target = ends[:, 1:].expand(-1, longest, -1).flatten(0, 1)
     goal_relation = relation(attractors.flatten(0, 1), goal_target).view(count, longest, -1)
     start_relation = relation(attractors[:, 0], ends[:, 0])  # (B, relation)
@@ -174,17 +153,11 @@ def compute(
         ),
         "displacement": 0.5
         * (
-            _mean(_pose_error(heads.displacement(z), batch.displacement), batch.valid)
-            + _mean(_pose_error(heads.displacement(shown_z), batch.shown_displacement), pair)
+            _mean(_pose_error(pose_of(z), batch.displacement), batch.valid)
+            + _mean(_pose_error(pose_of(shown_z), batch.shown_displacement), pair)
         ),
-        "shape": _distance(
-            heads.shape(shown_z[:, -1]).view(shown, SHAPE_POINTS, 2),
-            batch.shape.view(shown, SHAPE_POINTS, 2),
-        ).mean(),
-        "relation": _mean(_pose_error(heads.relation(goal_relation), batch.goal), near)
-        + _mean(
-            _pose_error(heads.relation(start_relation), batch.start), _near(batch.start) & related
-        ),
+        "relation": _mean(_pose_error(locate(goal_relation), batch.goal), near)
+        + _mean(_pose_error(locate(start_relation), batch.start), _near(batch.start) & related),
     }
     total = torch.stack([getattr(weights, name) * part for name, part in parts.items()]).sum()
     return total, {name: float(part.detach()) for name, part in parts.items()}
@@ -192,7 +165,6 @@ def compute(
 
 def relate(
     networks: BehaviorNetworks,
-    heads: AuxiliaryHeads,
     views: Views,
     steps: Steps,
     weights: LossWeights,
@@ -207,7 +179,7 @@ def relate(
     pose = torch.from_numpy(_vector(views.relation).astype(np.float32)).to(device)
     near = _near(pose)
     relation = networks.generator.relation(attractors[:, NOW][near], stored[:, TARGET][near])
-    related = _pose_error(heads.relation(relation), pose[near]).mean()
+    related = _pose_error(networks.generator.guide.locate(relation), pose[near]).mean()
 
     before, now = (
         networks.trunk(torch.from_numpy(images).to(device)) for images in (steps.before, steps.now)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from cbe import signature
 from cbe_training.networks import BehaviorNetworks, EncoderState
+from cbe_training.path import Path
 
 CHUNK = 384  # frames convolved at once; more does not fit a small CPU's cache
 
@@ -81,7 +82,7 @@ class Policy:
         count, config = len(memory.embedding), networks.config
         self._device = memory.embedding.device
         self._encoder = torch.zeros(2, count, config.encoder_state, device=self._device)
-        self._pose = torch.zeros(count, 3, device=self._device)
+        self._path = Path.begin(memory.embedding)
         self._generator = torch.zeros(2, count, config.generator_state, device=self._device)
         self._previous: Tensor | None = None
         self._start = torch.zeros(count, config.relation, device=self._device)
@@ -107,10 +108,11 @@ class Policy:
         self._previous[index] = features
         self.seen = Seen(motion[:, None], attractor[:, None])
         h, c = self._encoder[:, index].split(1)
-        before = None if first else EncoderState(h, c, self._pose[index])
+        before = None if first else EncoderState(h, c, Path(*(part[index] for part in self._path)))
         embedding, after = nets.encoder(motion[:, None], before)
         self._encoder[:, index] = torch.cat([after.h, after.c])
-        self._pose[index] = after.pose
+        for kept, new in zip(self._path, after.path, strict=True):
+            kept[index] = new
         state = self._generator[:, index]
         out = nets.generator(
             nets.generator.relation(attractor, self._memory.goal[index])[:, None],

@@ -107,7 +107,8 @@ def iterate(
     # Gaps are mixed: from one gap alone a few updates already make every other look slow or fast.
     for gap, part in ((USUAL_GAP, 2), (int(together.choice(OTHER_GAPS)), 1)):
         count = config.demonstrations // team.size * part // 3
-        frames.append(int(together.integers(shortest, longest + 1)))
+        drawn = int(together.integers(shortest, longest + 1))
+        frames.append(min(drawn, config.longest_steps // gap))
         behaviors = show(drives, count, frames[-1], gap, rng)
         rollouts = roll_out(driver, drives, behaviors, config, rng, expert_share=share)
         collided.append(rollouts.collided.mean())
@@ -156,7 +157,7 @@ class Updates:
             look_again=what is Learn.ALL,
         )
         with self._arithmetic():
-            loss, parts = losses.compute(learner.networks, learner.heads, batch, config.loss)
+            loss, parts = losses.compute(learner.networks, batch, config.loss)
         learner.sequences += len(chosen) * self._team.size
         if what is Learn.ALL:
             seeing, also = self._relate(1)
@@ -177,7 +178,7 @@ class Updates:
         seen = views.draw(self._drives, times * config.view_groups // each, rng)
         steps = views.draw_steps(self._drives, times * config.view_steps // each, rng)
         with self._arithmetic():
-            return losses.relate(learner.networks, learner.heads, seen, steps, config.loss, rng)
+            return losses.relate(learner.networks, seen, steps, config.loss, rng)
 
     def _step(self, loss: Tensor, parts: dict[str, float]) -> None:
         learner, config = self._learner, self._learner.config
