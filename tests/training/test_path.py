@@ -60,8 +60,9 @@ def embedded(steps: torch.Tensor) -> torch.Tensor:
     """z (B, T, 32) of frames that move so; what the LSTM adds to it is noise."""
     torch.manual_seed(0)
     poses = path.add_up(steps)
-    hidden = torch.randn(*poses.shape[:2], 256)
-    return BehaviorNetworks().encoder.embed(hidden, poses, path.follow(poses))
+    encoder = BehaviorNetworks().encoder
+    hidden = torch.randn(*poses.shape[:2], encoder.lstm.hidden_size)
+    return encoder.embed(hidden, poses, path.follow(poses))
 
 
 @pytest.mark.parametrize("frames", [17, 65, 129])

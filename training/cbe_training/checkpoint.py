@@ -10,8 +10,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from cbe.errors import ModelError
-from cbe_training.config import LossWeights, TrainConfig
-from cbe_training.networks import BehaviorNetworks, NetworkConfig
+from cbe_training.config import LossWeights, NetworkConfig, TrainConfig
+from cbe_training.networks import BehaviorNetworks
 
 logger = logging.getLogger(__name__)
 

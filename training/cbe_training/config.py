@@ -3,8 +3,6 @@
 from dataclasses import dataclass, field
 from enum import Enum
 
-from cbe_training.networks import NetworkConfig
-
 
 class Learn(Enum):
     """What a piece of a run learns."""
@@ -15,6 +13,22 @@ class Learn(Enum):
 
 
 @dataclass(frozen=True, slots=True)
+class NetworkConfig:
+    """Layer widths; the trunk's and the attractor's shapes are fixed by `cbe.signature`."""
+
+    pair_channels: tuple[int, int] = (40, 80)
+    motion: int = 64
+    encoder_state: int = 96
+    attractor_channels: int = 64
+    relation_channels: tuple[int, int] = (64, 48)
+    relation: int = 64
+    behavior: int = 64
+    guide: int = 64
+    generator_state: int = 128
+    head: int = 48
+
+
+@dataclass(frozen=True, slots=True)
 class LossWeights:
     """Weights of the loss terms; the auxiliary ones make a small budget enough."""
 
@@ -22,7 +36,7 @@ class LossWeights:
     progress: float = 2.0
     on_route: float = 0.1
     motion: float = 1.0  # relative pose of consecutive frames
-    displacement: float = 0.5  # pose since the start, in every z
+    displacement: float = 0.2  # pose since the start, in every z
     relation: float = 0.3  # relative pose of two views, from their attractors
     views: float = 0.5  # the same, of views that are not a rollout's
 
@@ -51,7 +65,9 @@ class TrainConfig:
     annealing_sequences: int = 13_000  # the expert's share falls from 1 to 0
     expert_episodes: float = 0.2  # always driven by the (noisy) expert
     wrong_episodes: float = 0.06  # shown another behavior's memory
-    joining_episodes: float = 0.1  # start in the middle of the behavior
+    joining_episodes: float = 0.15  # start in the middle of the behavior
+    kidnapped_episodes: float = 0.08  # are put elsewhere on the way
+    bin_episodes: float = 0.2  # meet bins that the demonstration did not
     without_attractors: float = 0.04  # behaviors learnt from z alone, as the ablation drives them
     without_embedding: float = 0.04  # and from attractors alone
     lookahead_m: float = 0.6

@@ -16,6 +16,11 @@ from cbe_hil_sim.world import World
 from cbe_hil_sim.worldbatch import WorldBatch
 
 SHORTEST_M, LONGEST_M = 8.0, 25.0
+BINS = 8  # at most, in a world's twin
+BIN_RADIUS_M, BIN_HEIGHT_M = 0.15, 1.0
+BIN_ASIDE_M = 0.3  # of a drive, at most
+BIN_PASS_M = 0.6  # left free on one side at least
+BINS_APART_M = 2.0
 _WORLDS_AT_ONCE = 8  # driven in one lock-step batch
 
 logger = logging.getLogger(__name__)
@@ -23,9 +28,13 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Drives:
-    """Worlds and N drives through them: `poses[i]` (T_i, 3) at 10 Hz in world `world[i]`."""
+    """Worlds and N drives through them: `poses[i]` (T_i, 3) at 10 Hz in world `world[i]`.
+
+    World `w + twins` is world w with bins on its drives' ways, for repetitions to avoid.
+    """
 
     batch: WorldBatch
+    twins: int
     clearance: Clearance
     world: NDArray[np.int64]
     poses: list[NDArray[np.float64]]
@@ -51,7 +60,11 @@ class Drives:
         logger.info(
             "%d drives, %.0f steps on average", len(poses), np.mean([len(p) for p in poses])
         )
-        return cls(WorldBatch.pack(worlds), Clearance(worlds), world, list(poses))
+        both = worlds + [
+            _with_bins(each, [poses[i] for i in np.flatnonzero(world == index)], seed)
+            for index, (each, seed) in enumerate(zip(worlds, seeds, strict=True))
+        ]
+        return cls(WorldBatch.pack(both), len(worlds), Clearance(both), world, list(poses))
 
 
 def unseen(worlds: int, per_world: int, cache: Path) -> Drives:
@@ -65,6 +78,25 @@ def cache_name(worlds: list[World], per_world: int) -> str:
     for world in worlds:
         digest.update(world.blocked.tobytes())
     return f"drives-{digest.hexdigest()[:12]}.npz"
+
+
+def _with_bins(world: World, drives: list[NDArray[np.float64]], seed: int) -> World:
+    """The world with bins standing on or just beside some of its drives."""
+    rng = np.random.default_rng([seed, 2])
+    crowded, standing = world, np.zeros((0, 2))
+    for _ in range(BINS if drives else 0):
+        path = drives[rng.integers(len(drives))]
+        x, y, yaw = path[rng.integers(len(path))]
+        left = np.array([-np.sin(yaw), np.cos(yaw)])
+        at = np.array([x, y]) + rng.uniform(-BIN_ASIDE_M, BIN_ASIDE_M) * left
+        surface = int(rng.integers(len(world.surfaces.texture)))
+        passages = at + np.array([[-1.0], [1.0]]) * (BIN_RADIUS_M + BIN_PASS_M / 2) * left
+        passable = world.clearance_at(passages).max() > BIN_PASS_M / 2
+        apart = np.linalg.norm(standing - at, axis=1).min(initial=np.inf)
+        if apart > BINS_APART_M and passable:
+            crowded = crowded.with_cylinder(at[0], at[1], BIN_RADIUS_M, BIN_HEIGHT_M, surface)
+            standing = np.concatenate([standing, at[None]])
+    return crowded
 
 
 def _drive(

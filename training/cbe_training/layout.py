@@ -82,7 +82,8 @@ def _matrix(entries: _Entries, columns: int, inputs: int) -> tuple[Tensor, Tenso
 
 def _basis(points: int) -> NDArray[np.float64]:
     """Legendre polynomials at equal shares of the time (points, DEGREES)."""
-    return legendre.legvander(np.linspace(-1.0, 1.0, points + 1)[1:], DEGREES - 1)
+    shares = np.linspace(-1.0, 1.0, points + 1)[1:]
+    return np.asarray(legendre.legvander(shares, DEGREES - 1), np.float64)
 
 
 def _points(points: int) -> Tensor:

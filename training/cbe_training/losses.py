@@ -35,6 +35,7 @@ class Minibatch:
     memory: Tensor  # (B,) row of the behavior it was shown
     right: Tensor  # (B,) whether that is the behavior it drives
     valid: Tensor  # (B, S)
+    steady: Tensor  # (B, S) valid, and the robot was not carried since it started
     waypoint_m: Tensor  # (B, S, 2)
     progress: Tensor  # (B, S)
     on_route: Tensor  # (B, S)
@@ -93,6 +94,7 @@ class Minibatch:
             memory=tensor(memory),
             right=tensor(rollouts.shown[chosen] == rollouts.driven[chosen]),
             valid=tensor(valid),
+            steady=tensor(valid & (np.arange(longest) < rollouts.carried[chosen, None])),
             waypoint_m=tensor(rollouts.waypoint_m[chosen, :longest]),
             progress=tensor(rollouts.progress[chosen, :longest]),
             on_route=tensor(rollouts.on_route[chosen, :longest].astype(np.float32)),
@@ -148,12 +150,12 @@ def compute(
         ),
         "motion": 0.5
         * (
-            _mean(_motion_error(networks.encoder.step(motion), batch.motion), batch.valid)
+            _mean(_motion_error(networks.encoder.step(motion), batch.motion), batch.steady)
             + _mean(_motion_error(networks.encoder.step(shown_motion), batch.shown_motion), pair)
         ),
         "displacement": 0.5
         * (
-            _mean(_pose_error(pose_of(z), batch.displacement), batch.valid)
+            _mean(_pose_error(pose_of(z), batch.displacement), batch.steady)
             + _mean(_pose_error(pose_of(shown_z), batch.shown_displacement), pair)
         ),
         "relation": _mean(_pose_error(locate(goal_relation), batch.goal), near)

@@ -1,39 +1,20 @@
-"""The behavior networks: one trunk shared by encoder and attractor, and a waypoint generator.
+"""The behavior networks: encoder, attractor and waypoint generator on one trunk.
 
-Paper, Sec. III-B and III-C, at about a seventh of the authors' parameters: a patch-like stem
-replaces their 5x5 convolutions, and every frame passes through it once.
+Paper, Sec. III-B and III-C, at a twentieth of the authors' parameters.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from cbe import signature
 from cbe_training import layout, path
+from cbe_training.config import NetworkConfig
 from cbe_training.layout import PATH_POINTS, TRACED
 from cbe_training.path import PLACE, PLACE_M, Path, place
+from cbe_training.vision import Attractor, Pair, Relation, Trunk
 
-
-@dataclass(frozen=True, slots=True)
-class NetworkConfig:
-    """Layer widths; the trunk's and the attractor's shapes are fixed by `cbe.signature`."""
-
-    pair_channels: tuple[int, int] = (64, 128)
-    motion: int = 192
-    encoder_state: int = 256
-    attractor_channels: int = 64
-    relation_channels: tuple[int, int] = (64, 96)
-    relation: int = 128
-    behavior: int = 128
-    guide: int = 96
-    generator_state: int = 320
-    head: int = 128
-
-
-ATTRACTOR_SHAPE = signature.ATTRACTOR_SHAPE
 STEP_SCALE = 5.0
 LOOKAHEAD_M = 0.6
 State = tuple[Tensor, Tensor]  # h, c of an LSTM, each (1, B, size)
@@ -54,57 +35,6 @@ class Generated(NamedTuple):
     progress: Tensor  # (B, T)
     on_route_logit: Tensor  # (B, T)
     state: State
-
-
-class Trunk(nn.Module):
-    """Image to features: one 8x8 convolution of stride 4, as a patch stem."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.stem = nn.Conv2d(3, signature.FEATURES[0], 8, stride=4, padding=2)
-
-    def forward(self, image: Tensor) -> Tensor:
-        """(N, 64, 64, 3) uint8 RGB to (N, 32, 16, 16)."""
-        x = image.permute(0, 3, 1, 2).float() / 64.0 - 2.0  # about unit variance
-        return F.relu(self.stem(x))
-
-
-class Pair(nn.Module):
-    """Motion features of two consecutive frames.
-
-    The first convolution over both frames' channels is a sum of two, so each frame is convolved
-    once and serves as `now` and, a tick later, as `previous`.
-    """
-
-    def __init__(self, config: NetworkConfig) -> None:
-        super().__init__()
-        first, second = config.pair_channels
-        self.first = nn.Conv2d(signature.FEATURES[0], 2 * first, 3, stride=2, padding=1)
-        self.rest = nn.Sequential(
-            nn.ReLU(),
-            nn.Conv2d(first, second, 3, stride=2, padding=1),
-            nn.ReLU(),
-            nn.Flatten(),
-            nn.Linear(second * 16, config.motion),
-            nn.ReLU(),
-        )
-
-    def forward(self, features: Tensor, previous: Tensor) -> Tensor:
-        """Features (N, 32, 16, 16) of frames and of the frames before, to (N, motion)."""
-        now, _ = self.first(features).chunk(2, dim=1)
-        _, before = self.first(previous).chunk(2, dim=1)
-        return self.rest(now + before)
-
-    def sequence(self, features: Tensor, batch: int) -> Tensor:
-        """Features (B * T, 32, 16, 16) of whole sequences to (B * T, motion).
-
-        The first frame is its own predecessor, as in the paper's implementation.
-        """
-        both = self.first(features)
-        both = both.view(batch, -1, *both.shape[1:])  # (B, T, 2 * first, 8, 8)
-        now, before = both.chunk(2, dim=2)
-        before = torch.cat([before[:, :1], before[:, :-1]], dim=1)
-        return self.rest((now + before).flatten(0, 1))
 
 
 class Encoder(nn.Module):
@@ -153,63 +83,6 @@ class Encoder(nn.Module):
         """LSTM output, pose (..., 3) and path (..., 2, DEGREES) to z (..., 32)."""
         traced = torch.cat([place(pose), series.flatten(-2) / PLACE_M], dim=-1)
         return torch.cat([traced, self.to_embedding(torch.cat([hidden, traced], dim=-1))], dim=-1)
-
-
-class Attractor(nn.Module):
-    """Features of one frame to 400 numbers in [0, 1], bounded so that they quantise evenly.
-
-    They are 8 channels of 5 rows and 10 columns: turning the robot shifts the columns.
-    """
-
-    def __init__(self, config: NetworkConfig) -> None:
-        super().__init__()
-        width = config.attractor_channels
-        self.layers = nn.Sequential(
-            nn.Conv2d(signature.FEATURES[0], width, 3, stride=(2, 1), padding=1),
-            nn.ReLU(),
-            nn.Conv2d(width, ATTRACTOR_SHAPE[0], (4, 7)),
-        )
-
-    def forward(self, features: Tensor) -> Tensor:
-        """(N, 32, 16, 16) to (N, 400)."""
-        return torch.sigmoid(self.layers(features)).flatten(1)
-
-
-class Relation(nn.Module):
-    """Where one attractor's view lies relative to another's (paper: attractor pairs).
-
-    Every column of one view is matched with every column of the other. A turn shows as a shifted
-    diagonal of that table and a move as a bent one, which a small convolution can read.
-    """
-
-    def __init__(self, config: NetworkConfig) -> None:
-        super().__init__()
-        channels, rows, columns = ATTRACTOR_SHAPE
-        first, second = config.relation_channels
-        self.now = nn.Linear(channels * rows, first)
-        self.target = nn.Linear(channels * rows, first, bias=False)
-        self.match = nn.Linear(3 * rows - 2, first, bias=False)
-        self.layers = nn.Sequential(
-            nn.ReLU(),
-            nn.Conv2d(first, second, 3, stride=2, padding=1),
-            nn.ReLU(),
-            nn.Flatten(),
-            nn.Linear(second * (columns // 2) ** 2, config.relation),
-            nn.ReLU(),
-        )
-
-    def forward(self, now: Tensor, target: Tensor) -> Tensor:
-        """Attractors (N, 400) twice, to (N, relation)."""
-        now = 2.0 * now.view(-1, *ATTRACTOR_SHAPE) - 1.0
-        target = 2.0 * target.view(-1, *ATTRACTOR_SHAPE) - 1.0
-        one, other = now.permute(0, 2, 3, 1), target.permute(0, 2, 1, 3)
-        # Each row with the same one and, since things grow as one comes near, its neighbours.
-        rows = [one @ other, one[:, 1:] @ other[:, :-1], one[:, :-1] @ other[:, 1:]]
-        match = torch.cat(rows, dim=1) / ATTRACTOR_SHAPE[0] ** 0.5  # (N, 13, 10, 10)
-        table = self.match(match.permute(0, 2, 3, 1))  # (N, 10 now, 10 target, first)
-        table = table + self.now(now.permute(0, 3, 1, 2).flatten(2))[:, :, None]
-        table = table + self.target(target.permute(0, 3, 1, 2).flatten(2))[:, None]
-        return self.layers(table.permute(0, 3, 1, 2))
 
 
 class Guide(nn.Module):

@@ -22,8 +22,11 @@ from cbe_training.policy import Policy, Seen, memorise
 
 FRAMES_PAST_GOAL = 3
 FRAMES_OFF_ROUTE = 4
+FRAMES_KIDNAPPED = 14  # and so long where it was carried away, to learn what lost looks like
+NEVER = 1 << 30
 ALIASED = 0.3  # share of behaviors rendered without antialiasing, as other renderers do
 REACHED = 0.985  # share of the path
+BIN_AWAY_M = 0.5  # from a repetition's start and goal
 NOISE_RAD = (0.0, 0.0, 0.15, 0.4)  # of the expert's waypoint, so that it has errors to correct
 
 
@@ -54,6 +57,7 @@ class Rollouts:
     driven: NDArray[np.int64]  # (B,) behavior it was labelled by
     goals: NDArray[np.float64]  # (B, 3) last pose of the shown behavior
     starts: NDArray[np.float64]  # (B, 3) first pose of the shown behavior
+    carried: NDArray[np.int64]  # (B,) frame before which it was put elsewhere, or NEVER
     arrived: NDArray[np.bool_]  # (B,) declared so itself
     collided: NDArray[np.bool_]
     success: NDArray[np.bool_]  # arrived within 0.5 m and 30 deg, without collision
@@ -104,6 +108,8 @@ def roll_out(
     count, gap = len(cast.driven), behaviors.gap
     paths, world = behaviors.paths.take(cast.driven), behaviors.world[cast.driven]
     last = cast.first.copy()
+    if training:
+        world = _among_bins(drives, world, paths, last, config, rng)
     starts = _jitter(drives, world, paths.poses[np.arange(count), last], config, rng)
     vehicle = Vehicle(starts, robot, noise=noise, rng=rng)
     vehicle.speed_mps = np.where(rng.random(count) < 0.5, rng.uniform(0.0, 0.5, count), 0.0)
@@ -124,6 +130,8 @@ def roll_out(
         rows = np.flatnonzero(active)
         if not len(rows):
             break
+        for row in np.flatnonzero(active & (cast.carried == tick)):
+            vehicle.poses[row] = _elsewhere(drives, behaviors.world[cast.driven[row]], rng)
         poses = vehicle.poses[rows]
         images = photograph(
             drives, world[rows], poses, cameras.take(rows), behaviors.supersample, rng
@@ -151,7 +159,8 @@ def roll_out(
         out.collided[rows] = hit
         past_goal[rows] += labels.progress >= REACHED
         off_route[rows] += labels.distance_m >= config.off_route_m
-        active[rows] = ~hit & (off_route[rows] < FRAMES_OFF_ROUTE) & ~out.arrived[rows]
+        patience = np.where(cast.carried[rows] <= tick, FRAMES_KIDNAPPED, FRAMES_OFF_ROUTE)
+        active[rows] = ~hit & (off_route[rows] < patience) & ~out.arrived[rows]
         if training:
             active[rows] &= past_goal[rows] < FRAMES_PAST_GOAL
     error = geometry.relative(paths.goals, vehicle.poses)
@@ -169,6 +178,7 @@ class _Cast:
     driven: NDArray[np.int64]  # (B,) behavior it starts on and is labelled by
     wrong: NDArray[np.bool_]  # (B,) whether they differ
     first: NDArray[np.int64]  # (B,) sample of its path it starts at
+    carried: NDArray[np.int64]  # (B,) frame before which it is put elsewhere, or NEVER
     expert_only: NDArray[np.bool_]  # (B,)
     wobble_rad: NDArray[np.float64]  # (B,) noise of the expert's waypoint
 
@@ -185,19 +195,22 @@ class _Cast:
         driven = np.repeat(np.arange(total), config.repeats)
         count = len(driven)
         if not training:
-            none = np.zeros(count, np.bool_)
-            return cls(driven, driven, none, np.zeros(count, np.int64), none, np.zeros(count))
+            none, zero = np.zeros(count, np.bool_), np.zeros(count, np.int64)
+            return cls(driven, driven, none, zero, zero + NEVER, none, np.zeros(count))
         other = (driven + 1 + rng.integers(0, total - 1, count)) % total
         # Another behavior of the same world could overlap.
         elsewhere = behaviors.world[other] != behaviors.world[driven]
         wrong = (rng.random(count) < config.wrong_episodes) & elsewhere
         joining = (rng.random(count) < config.joining_episodes) & ~wrong
-        middle = rng.integers(0, behaviors.paths.length[driven] * 6 // 10)
+        middle = rng.integers(0, behaviors.paths.length[driven] * 85 // 100)
+        kidnapped = (rng.random(count) < config.kidnapped_episodes) & ~wrong & ~joining
+        carried = rng.integers(4, behaviors.images.shape[1], count)
         return cls(
             shown=np.where(wrong, other, driven),
             driven=driven,
             wrong=wrong,
             first=np.where(joining, middle, 0),
+            carried=np.where(kidnapped, carried, NEVER),
             expert_only=rng.random(count) < config.expert_episodes,
             wobble_rad=rng.choice(NOISE_RAD, count),
         )
@@ -220,6 +233,7 @@ def _empty(
         driven=cast.driven,
         goals=behaviors.paths.goals[cast.shown],
         starts=behaviors.paths.poses[cast.shown, 0],
+        carried=cast.carried,
         arrived=np.zeros(count, np.bool_),
         collided=np.zeros(count, np.bool_),
         success=np.zeros(count, np.bool_),
@@ -299,6 +313,29 @@ def _jitter(
         starts[missing[fits]] = proposed[fits]
         missing = missing[~fits]
     return starts
+
+
+def _elsewhere(drives: Drives, world: np.int64, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Any pose (3,) on any drive through a world."""
+    path = drives.poses[rng.choice(np.flatnonzero(drives.world == world))]
+    return np.asarray(path[rng.integers(len(path))])
+
+
+def _among_bins(
+    drives: Drives,
+    world: NDArray[np.int64],
+    paths: track.Paths,
+    first: NDArray[np.int64],
+    config: TrainConfig,
+    rng: np.random.Generator,
+) -> NDArray[np.int64]:
+    """Worlds (B,), some exchanged for their twins where no bin stands at the start or the goal."""
+    twin = world + drives.twins
+    chosen = rng.random(len(world)) < config.bin_episodes
+    for end in (paths.poses[np.arange(len(world)), first], paths.goals):
+        room, among = (drives.clearance.at(where, end[:, :2]) for where in (world, twin))
+        chosen &= among >= np.minimum(room, BIN_AWAY_M)
+    return np.where(chosen, twin, world)
 
 
 def _turn(points: NDArray[np.float64], angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:
