@@ -21,9 +21,9 @@ _KNOWN = """
     Floor GRU Gather Gelu Gemm GlobalAveragePool Greater GreaterOrEqual HardSigmoid HardSwish
     Identity InstanceNormalization LSTM LayerNormalization LeakyRelu Less LessOrEqual Log
     LogSoftmax MatMul MatMulInteger Max MaxPool Min Mul Neg Not Or PRelu Pow QLinearConv
-    QLinearMatMul QuantizeLinear Reciprocal ReduceL2 ReduceMax ReduceMean ReduceMin ReduceSum Relu Reshape
-    Round Shape Sigmoid Sign Sin Slice Softmax Softplus Split Sqrt Squeeze Sub Tanh Transpose
-    Unsqueeze Where
+    QLinearMatMul QuantizeLinear Reciprocal ReduceL2 ReduceMax ReduceMean ReduceMin ReduceSum
+    Relu Reshape Round Shape Sigmoid Sign Sin Slice Softmax Softplus Split Sqrt Squeeze Sub Tanh
+    Transpose Unsqueeze Where
 """
 OPERATORS = frozenset(_KNOWN.split())
 """What a network of ours may be built of: no loops, no branches, nothing that fills memory."""
