@@ -77,7 +77,9 @@ class AccessConfig:
             # A reader who could serve "stop" would swallow it.
             _rule("end", _SERVES, [f"{own}rpc/record_stop", f"{own}rpc/teach_stop"]),
             _rule(
-                "live as reader", ["liveliness_token"], [f"{own}alive/record", f"{own}alive/teach"]
+                "live as reader",
+                ["liveliness_token"],
+                [f"{own}alive/{name}" for name in ("record", "black_box", "teach", "view")],
             ),
         ]
         granted = (

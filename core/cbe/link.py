@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import logging
-import struct
+import math
+import threading
 import time
-import uuid
-from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Self
 
 import msgspec
 import zenoh
 
 from cbe.errors import CbeError, LinkError, MessageError
 from cbe.inbox import Latest, Stream
+from cbe.publisher import Publisher, sequence
 from cbe.topics import KeyStyle, key_expression, subscription
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from cbe.codec import Message
     from cbe.linkconfig import LinkConfig
@@ -24,15 +27,13 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-T = TypeVar("T")
 JsonObject = dict[str, Any]
 
 MAX_JSON_BYTES = 2**16
 """Of a call or a status: ours have about a thousand; objects take many times that to unpack."""
 RETRY_S = 0.05  # between two tries to reach a process that may be starting
-_ATTACHMENT = struct.Struct("<qqB16s")
-"""rmw_zenoh's: sequence number, time sent in ns, length of the writer's id, that id."""
-_ID_SIZE = 16
+ANSWER_PATIENCE_S = 1.0
+"""Closing waits this long for calls that are being answered."""
 
 
 class Link:
@@ -43,8 +44,14 @@ class Link:
 
     def __init__(self, session: zenoh.Session, config: LinkConfig) -> None:
         self._session = session
+        self._declarations: list[Callable[[zenoh.Session], object]] = []
         self._declared: list[object] = []  # what Python drops, Zenoh undeclares
+        self._renewing = threading.Lock()
+        self._answering = 0  # calls
+        self._answered = threading.Condition()
         self.config = config
+        self.heard_s = -math.inf
+        """When a subscribed topic was last heard, by the monotonic clock."""
 
     @classmethod
     def open(cls, config: LinkConfig) -> Link:
@@ -53,19 +60,45 @@ class Link:
         Raises ConfigError, before anything is opened, for certificates that cannot work.
         """
         config.check()
-        settings = zenoh.Config()
-        for key, value in config.zenoh_json5().items():
-            settings.insert_json5(key, value)
+        return cls(_session(config), config)
+
+    def renew(self, timeout_s: float) -> bool:
+        """Change to a new session if one opens within the time; tells whether it did.
+
+        A session is slow to notice that a silent network is back (TCP and Zenoh both wait longer
+        with each failure), and may go deaf for good. Publishers, inboxes and calls served stay
+        the same. Only a link in client mode can be renewed: one that listens holds its port.
+        """
+        if self.config.mode != "client":
+            return False
         try:
-            session = zenoh.open(settings)
-        except zenoh.ZError as error:
-            raise LinkError(_why_not_open(config, error)) from error
-        return cls(session, config)
+            session = _session(replace(self.config, open_timeout_s=timeout_s))
+        except LinkError:
+            return False
+        with self._renewing:
+            try:
+                if self._session.is_closed():
+                    raise zenoh.ZError("the link is closed")
+                declared = [declare(session) for declare in self._declarations]
+            except zenoh.ZError:
+                _close(session)
+                return False
+            old, self._session, self._declared = self._session, session, declared
+        # Closing waits up to 10 s for a network that does not answer.
+        threading.Thread(target=_close, args=(old,), name="link closer").start()
+        return True
 
     def close(self) -> None:
-        """Undeclare everything and disconnect; again does nothing."""
-        if not self._session.is_closed():
-            self._session.close()  # type: ignore[no-untyped-call]
+        """Undeclare everything and disconnect; again does nothing.
+
+        Calls that are being answered come first: one that ends the process, such as a recorder's
+        `record_stop`, would else be overtaken by the end and its caller told that nobody answers.
+        """
+        with self._answered:
+            self._answered.wait_for(lambda: not self._answering, ANSWER_PATIENCE_S)
+        with self._renewing:
+            if not self._session.is_closed():
+                self._session.close()  # type: ignore[no-untyped-call]
 
     def __enter__(self) -> Self:
         return self
@@ -89,7 +122,9 @@ class Link:
         """A publisher of a topic's messages."""
         style = self.config.style
         key = key_expression(topic, style, self.config.domain)
-        return Publisher(self._declare(key), _cdr, attach=style is KeyStyle.RMW_ZENOH)
+        publisher: Publisher[M] = Publisher(key, _cdr, attach=style is KeyStyle.RMW_ZENOH)
+        self._declare(key, publisher.declare)
+        return publisher
 
     def latest_json(self, name: str) -> Latest[JsonObject]:
         """A slot with the newest JSON object under this robot's own key, such as "status"."""
@@ -97,9 +132,18 @@ class Link:
         self._subscribe(self.config.own_key(name), inbox)
         return inbox
 
+    def stream_json(self, name: str, capacity: int = 256) -> Stream:
+        """Every JSON object under this robot's own key as bytes, for a recorder."""
+        inbox = Stream(capacity)
+        self._subscribe(self.config.own_key(name), inbox)
+        return inbox
+
     def json_publisher(self, name: str) -> Publisher[JsonObject]:
         """A publisher of JSON objects under this robot's own key."""
-        return Publisher(self._declare(self.config.own_key(name)), msgspec.json.encode)
+        key = self.config.own_key(name)
+        publisher: Publisher[JsonObject] = Publisher(key, msgspec.json.encode)
+        self._declare(key, publisher.declare)
+        return publisher
 
     def serve(self, name: str, handler: Callable[[JsonObject], JsonObject]) -> None:
         """Answer calls to `rpc/<name>`; an exception of the handler is sent as an error reply.
@@ -109,7 +153,7 @@ class Link:
         key = self.config.own_key(f"rpc/{name}")
 
         def answer(query: zenoh.Query) -> None:
-            with query:
+            with self._busy_answering(), query:
                 payload = query.payload
                 try:
                     request = _from_json(payload.to_bytes()) if payload else {}
@@ -120,10 +164,10 @@ class Link:
                     logger.exception("rpc %s failed", name)
                     query.reply_err(f"{type(error).__name__}: {error}".encode())
 
-        self._declared.append(self._guarded(self._session.declare_queryable, key, answer))
+        self._declare(key, lambda session: session.declare_queryable(key, answer))
 
     def call(
-        self, name: str, request: JsonObject | None = None, timeout_s: float = 2.0
+        self, name: str, request: JsonObject | None = None, timeout_s: float = 5.0
     ) -> JsonObject:
         """The reply to `rpc/<name>`; raises LinkError for an error reply, or for none in time.
 
@@ -152,7 +196,7 @@ class Link:
     def declare_alive(self, process: str) -> None:
         """Show others that this process lives, until the link closes or breaks."""
         key = self.config.own_key(f"alive/{process}")
-        self._declared.append(self._guarded(self._session.liveliness().declare_token, key))
+        self._declare(key, lambda session: session.liveliness().declare_token(key))
 
     def alive(self, process: str, timeout_s: float = 1.0) -> bool:
         """Whether a process of that name lives. One that hangs looks alive for some seconds."""
@@ -177,8 +221,22 @@ class Link:
                 changed(alive)
 
         key = self.config.own_key(f"alive/{process}")
-        declare = self._session.liveliness().declare_subscriber
-        self._declared.append(self._guarded(declare, key, on_sample, history=True))
+
+        def declare(session: zenoh.Session) -> object:
+            return session.liveliness().declare_subscriber(key, on_sample, history=True)
+
+        self._declare(key, declare)
+
+    @contextmanager
+    def _busy_answering(self) -> Iterator[None]:
+        with self._answered:
+            self._answering += 1
+        try:
+            yield
+        finally:
+            with self._answered:
+                self._answering -= 1
+                self._answered.notify_all()
 
     def _subscription(self, topic: Topic[Any]) -> str:
         return subscription(topic, self.config.style, self.config.domain)
@@ -186,49 +244,29 @@ class Link:
     def _subscribe(self, key: str, inbox: Latest[Any] | Stream) -> None:
         def on_sample(sample: zenoh.Sample) -> None:
             if sample.kind == zenoh.SampleKind.PUT:
-                inbox.store(sample.payload.to_bytes(), _sequence(sample.attachment))
+                self.heard_s = time.monotonic()
+                inbox.store(sample.payload.to_bytes(), sequence(sample.attachment))
 
-        origin = zenoh.Locality.REMOTE
-        declare = self._session.declare_subscriber
-        self._declared.append(self._guarded(declare, key, on_sample, allowed_origin=origin))
+        def declare(session: zenoh.Session) -> object:
+            remote = zenoh.Locality.REMOTE
+            return session.declare_subscriber(key, on_sample, allowed_origin=remote)
 
-    def _declare(self, key: str) -> zenoh.Publisher:
-        publisher: zenoh.Publisher = self._guarded(
-            self._session.declare_publisher,
-            key,
-            # BLOCK would stall a put for 5 s on a subscriber that has stopped.
-            congestion_control=zenoh.CongestionControl.DROP,
-        )
-        return publisher
+        self._declare(key, declare)
+
+    def _declare(self, key: str, declare: Callable[[zenoh.Session], object]) -> None:
+        """Declare on this session, and on each that takes its place."""
+        with self._renewing:
+            try:
+                self._declared.append(declare(self._session))
+            except zenoh.ZError as error:
+                raise LinkError(f"the link cannot use {key}: {error}") from error
+            self._declarations.append(declare)
 
     def _guarded(self, method: Callable[..., Any], key: str, *values: Any, **options: Any) -> Any:
         try:
             return method(key, *values, **options)
         except zenoh.ZError as error:
             raise LinkError(f"the link cannot use {key}: {error}") from error
-
-
-class Publisher(Generic[T]):
-    """Publishes under one key; drops a message rather than wait for a slow receiver."""
-
-    def __init__(
-        self, publisher: zenoh.Publisher, encode: Callable[[T], bytes], attach: bool = False
-    ) -> None:
-        self._publisher = publisher
-        self._encode = encode
-        self._id = uuid.uuid4().bytes if attach else None
-        self._sequence = 0
-
-    def put(self, message: T) -> None:
-        """Send; raises MessageError for a value that does not fit, LinkError on a closed link."""
-        attachment = None
-        if self._id is not None:
-            self._sequence += 1
-            attachment = _ATTACHMENT.pack(self._sequence, time.time_ns(), _ID_SIZE, self._id)
-        try:
-            self._publisher.put(self._encode(message), attachment=attachment)
-        except zenoh.ZError as error:
-            raise LinkError(f"cannot publish {self._publisher.key_expr}: {error}") from error
 
 
 def _cdr(message: Message) -> bytes:
@@ -244,12 +282,19 @@ def _from_json(payload: bytes) -> JsonObject:
         raise MessageError(f"{len(payload)} bytes are no JSON object: {error}") from error
 
 
-def _sequence(attachment: zenoh.ZBytes | None) -> int | None:
-    """The sender's sequence number; bare topics carry none."""
-    if attachment is None or len(attachment) != _ATTACHMENT.size:
-        return None
-    sequence: int = _ATTACHMENT.unpack(attachment.to_bytes())[0]
-    return sequence
+def _session(config: LinkConfig) -> zenoh.Session:
+    settings = zenoh.Config()
+    for key, value in config.zenoh_json5().items():
+        settings.insert_json5(key, value)
+    try:
+        return zenoh.open(settings)
+    except zenoh.ZError as error:
+        raise LinkError(_why_not_open(config, error)) from error
+
+
+def _close(session: zenoh.Session) -> None:
+    with suppress(zenoh.ZError):  # it gives up in time
+        session.close()  # type: ignore[no-untyped-call]
 
 
 def _why_not_open(config: LinkConfig, error: Exception) -> str:

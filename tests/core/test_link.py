@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import zenoh
 
+import cbe.link
 from cbe.errors import ConfigError, LinkError, MessageError
 from cbe.inbox import Latest, Stream
 from cbe.link import Link
@@ -21,7 +22,7 @@ from cbe.messages import Twist, TwistStamped
 from cbe.rays import scan_message
 from cbe.topics import CMD_VEL, CMD_VEL_UNSTAMPED, SCAN, KeyStyle, key_expression
 
-DEADLINE_S = 15.0
+DEADLINE_S = 60.0  # for what takes a moment on an idle machine
 
 pytestmark = pytest.mark.loopback
 
@@ -160,7 +161,7 @@ def ready(link: Link, name: str) -> None:
 
     def served() -> bool:
         with contextlib.suppress(LinkError):
-            link.call(name, {"probe": True})
+            link.call(name, {"probe": True}, timeout_s=1.0)
             return True
         return False
 
@@ -170,7 +171,7 @@ def ready(link: Link, name: str) -> None:
 def test_call_returns_what_the_handler_answers(hub: Link, client: Link) -> None:
     hub.serve("double", lambda request: {"value": 2 * request.get("value", 0)})
     ready(client, "double")
-    assert client.call("double", {"value": 21}) == {"value": 42}
+    assert client.call("double", {"value": 21}, DEADLINE_S) == {"value": 42}
 
 
 @pytest.mark.parametrize("error", [ConfigError("no such pose"), ZeroDivisionError("oh")])
@@ -186,7 +187,7 @@ def test_exception_of_a_handler_reaches_the_caller(
     hub.serve(name, fail)
     ready(client, name)
     with pytest.raises(LinkError, match=str(error)):
-        client.call(name)
+        client.call(name, timeout_s=DEADLINE_S)
 
 
 def test_request_that_is_no_json_object_gets_an_error_reply(hub: Link, client: Link) -> None:
@@ -199,7 +200,7 @@ def test_request_that_is_no_json_object_gets_an_error_reply(hub: Link, client: L
 
 def test_call_that_nobody_serves_fails(client: Link) -> None:
     with pytest.raises(LinkError, match="nobody answers"):
-        client.call("nothing")
+        client.call("nothing", timeout_s=0.3)
 
 
 def test_call_that_takes_too_long_fails(hub: Link, client: Link) -> None:
@@ -214,6 +215,49 @@ def test_call_that_takes_too_long_fails(hub: Link, client: Link) -> None:
     ready(client, "hang")
     with pytest.raises(LinkError, match=r"within 0\.2 s"):
         client.call("hang", timeout_s=0.2)
+    release.set()
+
+
+def test_call_that_ends_its_server_is_answered(hub: Link, endpoint: str) -> None:
+    ending = threading.Event()
+    link = Link.open(LinkConfig(connect=(endpoint,)))
+
+    def end(request: dict[str, Any]) -> dict[str, Any]:
+        if "probe" not in request:
+            ending.set()
+            time.sleep(0.1)  # the other thread is well ahead
+        return {"ended": True}
+
+    def close() -> None:
+        ending.wait(DEADLINE_S)
+        link.close()
+
+    link.serve("end", end)
+    ready(hub, "end")
+    closing = threading.Thread(target=close)
+    closing.start()
+    assert hub.call("end") == {"ended": True}
+    closing.join(DEADLINE_S)
+    assert link._session.is_closed()
+
+
+def test_handler_that_hangs_holds_up_closing_for_a_moment_only(
+    hub: Link, endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cbe.link, "ANSWER_PATIENCE_S", 0.05)
+    called, release = threading.Event(), threading.Event()
+
+    def hang(_request: dict[str, Any]) -> dict[str, Any]:
+        called.set()
+        release.wait(DEADLINE_S)
+        return {}
+
+    link = Link.open(LinkConfig(connect=(endpoint,)))
+    link.serve("hang_on", hang)
+    with contextlib.suppress(LinkError):
+        until(called.is_set, lambda: hub.call("hang_on", timeout_s=0.1))
+    link.close()
+    assert link._session.is_closed()
     release.set()
 
 
