@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -59,14 +60,7 @@ def _parser() -> argparse.ArgumentParser:
 
     route = commands.add_parser("route", help="repeat long drives from room to room")
     shared.add_journeys(route)
-    route.add_argument(
-        "--segment-steps", type=int, metavar="K", help="longest segment (the model's own)"
-    )
-    route.add_argument(
-        "--precision", type=AttractorPrecision, choices=list(AttractorPrecision),
-        default=AttractorPrecision.U8, metavar="f32|u8|u4",
-        help="of attractors; with f32 embeddings are f32 too, else f16 (%(default)s)",
-    )  # fmt: skip
+    shared.add_teaching(route)
     route.add_argument(
         "--no-relocation", action="store_true", help="hide the joints' attractors from the robot"
     )
@@ -82,8 +76,25 @@ def _parser() -> argparse.ArgumentParser:
         "--precision", type=shared.precisions, default=list(AttractorPrecision),
         metavar="P,P,...", help="of attractors: f32, u8, u4 (all three)",
     )  # fmt: skip
+    compression.add_argument("--adaptive", action="store_true", help="as cbe-bench route's")
     compression.add_argument("--plot", type=Path, metavar="FILE", help="write the figure")
     compression.set_defaults(run=_compression)
+
+    kidnap = commands.add_parser(
+        "kidnap", help="carry robots elsewhere, or give them another route's memory"
+    )
+    shared.add_journeys(kidnap, length_m=12.0)
+    shared.add_teaching(kidnap)
+    kidnap.add_argument(
+        "--stop", type=float, metavar="P",
+        help="LOST above this probability; near 1 the curve shows what others would do",
+    )  # fmt: skip
+    kidnap.set_defaults(run=_kidnap, episodes=1000)
+
+    join = commands.add_parser("join", help="set robots down anywhere along long routes")
+    shared.add_journeys(join)
+    shared.add_teaching(join)
+    join.set_defaults(run=_join)
 
     manifold = commands.add_parser("manifold", help="map the embeddings of many demonstrations")
     manifold.add_argument("--steps", type=int, default=100, help="length, 0.1 s each (%(default)s)")
@@ -94,6 +105,15 @@ def _parser() -> argparse.ArgumentParser:
     manifold.add_argument("--plot", type=Path, metavar="FILE", help="write the map")
     shared.add_output(manifold)
     manifold.set_defaults(run=_manifold)
+
+    faults = commands.add_parser("faults", help="drive under injected faults")
+    faults.add_argument("--steps", type=int, default=128, help="length, 0.1 s each (%(default)s)")
+    faults.add_argument(
+        "--faults", type=lambda text: text.split(","), default=[], metavar="NAME[:LEVEL],...",
+        help='such as "frame-loss,camera:black" (all)',
+    )  # fmt: skip
+    shared.add_behaviors(faults)
+    faults.set_defaults(run=_faults, episodes=40)
 
     compare = commands.add_parser("compare", help="compare two results episode by episode")
     for name in ("a", "b"):
@@ -110,6 +130,13 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     shared.add_output(speed)
     speed.set_defaults(run=_speed)
+
+    soak = commands.add_parser("soak", help="repeat a route in real time and hold it to bars")
+    soak.add_argument("--minutes", type=float, default=15.0, help="how long (%(default)s)")
+    soak.add_argument("--seed", type=int, default=1, help="house and drive (%(default)s)")
+    soak.add_argument("--model", type=Path, metavar="DIR", help="folder of ONNX files")
+    shared.add_output(soak)
+    soak.set_defaults(run=_soak)
     return parser
 
 
@@ -126,8 +153,7 @@ def _route(options: argparse.Namespace) -> None:
     journeys = shared.journeys(options)
     if options.no_relocation:
         journeys = replace(journeys, memory=Memory.NO_RELOCATION)
-    precision = route.precision_of(options.precision)
-    done = route.run(route.RouteConfig(journeys, options.segment_steps, precision))
+    done = route.run(route.RouteConfig(journeys, shared.teaching(options)))
     _report(options, done, f"{options.length_m:g} m")
 
 
@@ -142,12 +168,30 @@ def _report(options: argparse.Namespace, done: "Evaluation", what: str) -> None:
         sheet.draw(done.traces, options.world, options.plot, title)
 
 
+def _kidnap(options: argparse.Namespace) -> None:
+    from cbe_bench import kidnap
+
+    config = kidnap.KidnapConfig(shared.journeys(options), shared.teaching(options), options.stop)
+    result = kidnap.measure(config)
+    _write(options.json, result)
+    _say(kidnap.table(result))
+
+
+def _join(options: argparse.Namespace) -> None:
+    from cbe_bench import join
+
+    result = join.measure(join.JoinConfig(shared.journeys(options), shared.teaching(options)))
+    _write(options.json, result)
+    _say(json.dumps({key: value for key, value in result.items() if key != "runs"}, indent=2))
+
+
 def _compression(options: argparse.Namespace) -> None:
     from cbe_bench import compression
-    from cbe_bench.route import RouteConfig
+    from cbe_bench.route import RouteConfig, Teaching
 
     lengths = options.segment_steps or compression.SEGMENT_STEPS
-    result = compression.measure(RouteConfig(shared.journeys(options)), lengths, options.precision)
+    config = RouteConfig(shared.journeys(options), Teaching(adaptive=options.adaptive))
+    result = compression.measure(config, lengths, options.precision)
     _write(options.json, result)
     _say(compression.table(result))
     if options.plot:
@@ -194,6 +238,16 @@ def _manifold(options: argparse.Namespace) -> None:
     _say(manifold.table(result))
 
 
+def _faults(options: argparse.Namespace) -> None:
+    from cbe_bench import faults
+    from cbe_bench.faultlist import chosen
+
+    run = shared.behaviors(options, options.steps)
+    result = faults.measure(faults.FaultsConfig(run, chosen(options.faults)))
+    _write(options.json, result)
+    _say(faults.table(result))
+
+
 def _compare(options: argparse.Namespace) -> None:
     from cbe_bench.tally import compare
 
@@ -205,6 +259,17 @@ def _compare(options: argparse.Namespace) -> None:
         f"b less a: {100.0 * result['difference']:+.1f} points ({low:+.1f} to {high:+.1f}) over "
         f"{result['pairs']} pairs"
     )
+
+
+def _soak(options: argparse.Namespace) -> None:
+    from cbe_bench import soak
+
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # its children end with it
+    soaked = soak.run(options.minutes, options.seed, options.model, _note)
+    _write(options.json, soaked.json())
+    _say(soaked.table())
+    if soaked.failures:
+        raise soak.BarError("; ".join(soaked.failures))
 
 
 def _speed(options: argparse.Namespace) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cbe_bench import route
-from cbe_bench.route import RouteConfig, precision_of
+from cbe_bench.route import RouteConfig, Teaching, precision_of
 from cbe_runtime.route import AttractorPrecision
 
 if TYPE_CHECKING:
@@ -34,15 +34,15 @@ def measure(
         CbeError: the model, the world or an option cannot be used.
     """
     variants = [
-        replace(config, segment_steps=steps, precision=precision_of(precision))
+        replace(config, teaching=Teaching(steps, precision_of(precision), config.teaching.adaptive))
         for precision in precisions
         for steps in segment_steps
     ]
     rows = []
     for variant in variants:
         named = {
-            "segment_steps": variant.segment_steps,
-            "precision": variant.precision.attractor.value,
+            "segment_steps": variant.teaching.segment_steps,
+            "precision": variant.teaching.precision.attractor.value,
         }
         done = route.run(variant, "K {segment_steps}, {precision}".format(**named)).summary
         rows.append(named | {key: value for key, value in done.items() if key != "runs"})

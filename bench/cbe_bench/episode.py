@@ -25,7 +25,9 @@ STUCK_M, STUCK_TICKS = 0.2, 100
 TIMEOUT_FACTOR, TIMEOUT_STEPS = 3, 100
 _SEARCH_BACK, _SEARCH_AHEAD = 10, 30  # samples round the last nearest: drives cross themselves
 _STANDING_M = 1e-3  # moved in one step
-_BRAKING_STEPS = 50
+BRAKING_STEPS = 50
+_HONEST = {None, Reason.TIMEOUT, Reason.BLANK_IMAGE, Reason.FROZEN_CAMERA}
+"""What may stop a follower here; another fault is of the simulation or the networks."""
 
 
 class Outcome(StrEnum):
@@ -85,26 +87,25 @@ def ride(
     """Let `driver` repeat `demonstration` (T, 3) from rest at `start` (3,).
 
     Raises:
-        CbeError: the follower stopped for another reason than a timeout, which in simulation
-            means a fault of its own.
+        CbeError: the follower stopped for a fault of the simulation or of its networks.
     """
     backend.reset(start[None])
     driver.start()
-    judge = _Judge(demonstration, start)
+    judge = Judge(demonstration, start)
     ended: Outcome | None = None
     arrived_at: int | None = None
-    for step in range(judge.timeout_steps + _BRAKING_STEPS):
-        decision = driver.step(_observe(backend, see, step), step * STEP_S)
+    for step in range(judge.timeout_steps + BRAKING_STEPS):
+        decision = driver.step(observe(backend, see, step), step * STEP_S)
         backend.step(np.array([decision.speed_mps]), np.array([decision.yaw_rate_rad_s]))
         judge.moved(backend)
-        if decision.state is State.STOPPED and decision.reason is not Reason.TIMEOUT:
+        if decision.reason not in _HONEST:
             raise CbeError(f"the follower stopped in simulation: {decision.reason}")
         if decision.state is State.ARRIVED:
             arrived_at = step if arrived_at is None else arrived_at
         if bool(backend.collided[0]):
             ended = Outcome.COLLISION
         elif arrived_at is not None:
-            if judge.standing or step - arrived_at >= _BRAKING_STEPS:
+            if judge.standing or step - arrived_at >= BRAKING_STEPS:
                 ended = judge.arrival()
         else:
             ended = judge.failure(decision)
@@ -113,7 +114,7 @@ def ride(
     return judge.ride(ended or Outcome.TIMEOUT)
 
 
-class _Judge:
+class Judge:
     """Follows the true pose along the demonstration."""
 
     def __init__(self, demonstration: NDArray[np.float64], start: NDArray[np.float64]) -> None:
@@ -140,9 +141,14 @@ class _Judge:
         self._reached |= self._error()[0] < PAPER_SUCCESS_M
 
     @property
+    def moved_m(self) -> float:
+        """Distance between the last two poses; 0 at the start."""
+        return float(np.hypot(*(self._poses[-1] - self._poses[-2:][0])[:2]))
+
+    @property
     def standing(self) -> bool:
-        before, now = self._poses[-2:]
-        return float(np.hypot(*(now - before)[:2])) < _STANDING_M
+        """Whether the robot did not move in the last step."""
+        return self.moved_m < _STANDING_M
 
     def arrival(self) -> Outcome:
         """Judge the standing robot that declared its arrival."""
@@ -159,7 +165,7 @@ class _Judge:
             moved = np.hypot(*(np.array(self._ticks) - self._ticks[0]).T)
             if len(self._ticks) == STUCK_TICKS and moved.max() < STUCK_M:
                 return Outcome.STUCK
-        timed_out = decision.state is State.STOPPED or len(self._poses) > self.timeout_steps
+        timed_out = decision.reason is Reason.TIMEOUT or len(self._poses) > self.timeout_steps
         return Outcome.TIMEOUT if timed_out else None
 
     def ride(self, outcome: Outcome) -> Ride:
@@ -173,7 +179,8 @@ class _Judge:
         return float(np.hypot(error[0], error[1])), abs(float(error[2]))
 
 
-def _observe(backend: Backend, see: See, step: int) -> Observation:
+def observe(backend: Backend, see: See, step: int) -> Observation:
+    """What a follower is given in a step, just received."""
     seen = backend.observe()
     now_s, stamp_ns = step * STEP_S, round(step * STEP_S * 1e9)
     return Observation(

@@ -5,9 +5,9 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +19,14 @@ from cbe_bench.place import BACKENDS, Bin, Place, is_scene, world_seeds
 from cbe_bench.scenario import BIN_MARGIN_SAMPLES, GROUP, Scenario, Terms, scenarios
 from cbe_bench.tally import Record, summary
 from cbe_runtime import routefile
-from cbe_runtime.follower import Follower
+from cbe_runtime.follower import Follower, FollowerConfig
 from cbe_runtime.networks import PACKAGED_MODELS, Networks
 from cbe_runtime.route import Route
 
 FARTHEST_M = 1.0
 """Clearances beyond count as this; pybullet looks no farther."""
+
+T = TypeVar("T")
 
 Teach = Callable[[Networks, Sequence[NDArray[np.uint8]]], Route]
 """From a drive's views (64, 64, 3), one a step, to its route."""
@@ -117,33 +119,65 @@ def evaluate(config: RunConfig, teach: Teach, label: str) -> Evaluation:
     Raises:
         CbeError: the model, the world or an option cannot be used.
     """
-    from joblib import Parallel, delayed
-    from tqdm import tqdm
-
     model_id = Networks.load(config.model).model_id  # refused here rather than in every process
-    seeds = world_seeds(config.terms.world, config.world_seeds)
-    groups = math.ceil(config.episodes / GROUP)
-    jobs = min(config.jobs or os.cpu_count() or 1, groups)
-    tasks = (
-        delayed(_drive_group)(config, teach, seeds, g, min(GROUP, config.episodes - g * GROUP))
-        for g in range(groups)
-    )
-    traces: list[Trace] = []
-    with tqdm(total=config.episodes, desc=label, unit="ep") as bar:
-        for done in Parallel(n_jobs=jobs, return_as="generator_unordered")(tasks):
-            traces += done
-            bar.update(len(done))
-            arrived = sum(trace.record.success for trace in traces)
-            bar.set_postfix_str(f"success {arrived / len(traces):.3f}")
-    traces.sort(key=lambda trace: trace.record.index)
+
+    def rate(traces: Sequence[Trace]) -> str:
+        return f"success {sum(trace.record.success for trace in traces) / len(traces):.3f}"
+
+    drive = functools.partial(_drive, config, teach)
+    traces = each_episode(config, drive, label, rate)
     records = [trace.record for trace in traces]
     return Evaluation(summary(records, config.to_dict(), model_id), traces)
 
 
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """Where an episode takes place; `open_` opens another of its world's split by its seed.
+
+    What is opened is closed after the group of episodes that share a stage's worlds.
+    """
+
+    networks: Networks
+    place: Place
+    scenario: Scenario
+    seeds: Sequence[int]
+    open_: Callable[[int], Place]
+
+
+def each_episode(
+    config: RunConfig,
+    drive: Callable[[Stage], T],
+    label: str,
+    note: Callable[[Sequence[T]], str] = lambda done: "",
+) -> list[T]:
+    """What `drive` makes of each episode, in their order; in parallel, with a progress bar.
+
+    Raises:
+        CbeError: the world or an option cannot be used.
+    """
+    from joblib import Parallel, delayed
+    from tqdm import tqdm
+
+    seeds = world_seeds(config.terms.world, config.world_seeds)
+    groups = math.ceil(config.episodes / GROUP)
+    jobs = min(config.jobs or os.cpu_count() or 1, groups)
+    tasks = (
+        delayed(_drive_group)(config, drive, seeds, g, min(GROUP, config.episodes - g * GROUP))
+        for g in range(groups)
+    )
+    found: list[tuple[int, T]] = []
+    with tqdm(total=config.episodes, desc=label, unit="ep") as bar:
+        for done in Parallel(n_jobs=jobs, return_as="generator_unordered")(tasks):
+            found += done
+            bar.update(len(done))
+            bar.set_postfix_str(note([each for _, each in found]))
+    return [each for _, each in sorted(found, key=lambda numbered: numbered[0])]
+
+
 def _drive_group(
-    config: RunConfig, teach: Teach, seeds: Sequence[int], group: int, count: int
-) -> list[Trace]:
-    """One process's task: the first `count` episodes of a group."""
+    config: RunConfig, drive: Callable[[Stage], T], seeds: Sequence[int], group: int, count: int
+) -> list[tuple[int, T]]:
+    """One process's task: the first `count` episodes of a group, with their numbers."""
     use_one_thread()
     networks = _networks(config.model)
     with ExitStack() as places:
@@ -154,28 +188,41 @@ def _drive_group(
             return place
 
         return [
-            _drive(networks, config, teach, place, scenario)
+            (scenario.index, drive(Stage(networks, place, scenario, seeds, open_)))
             for place, scenario in scenarios(config.terms, group, count, seeds, open_)
         ]
 
 
-def _drive(
-    networks: Networks, config: RunConfig, teach: Teach, place: Place, scenario: Scenario
-) -> Trace:
+def stored_route(stage: Stage, teach: Teach) -> tuple[Route, int]:
+    """The route of the stage's drive as its file holds it, and that file's bytes."""
+    with stage.place.backend() as (backend, see):
+        views = film(backend, see, stage.scenario.demonstration)
+    data = routefile.dump(teach(stage.networks, views))
+    return routefile.parse(data), len(data)
+
+
+def _drive(config: RunConfig, teach: Teach, stage: Stage) -> Trace:
     """Teach the scenario's demonstration and repeat it from the bytes of its route file."""
-    with place.backend() as (backend, see):
-        data = routefile.dump(teach(networks, film(backend, see, scenario.demonstration)))
-    route = routefile.parse(data)
+    networks, place, scenario = stage.networks, stage.place, stage.scenario
+    route, size_bytes = stored_route(stage, teach)
     stored = Stored(
-        scenario.length_m, route.steps, len(route.segments), len(route.attractors), len(data)
+        scenario.length_m, route.steps, len(route.segments), len(route.attractors), size_bytes
     )
-    follower = Follower(networks, config.memory.of(route))
+    follower = Follower(networks, config.memory.of(route), config=_follower_config(config.memory))
     rng = np.random.default_rng([config.terms.seed, scenario.index, 1])
     with place.backend(noise=config.noise, rng=rng, bins=scenario.bins) as (backend, see):
         driven = ride(follower, backend, see, scenario.demonstration, scenario.start)
     return Trace(
         _record(scenario, driven), stored, scenario.demonstration, driven.poses, scenario.bins
     )
+
+
+def _follower_config(memory: Memory) -> FollowerConfig:
+    """One that is never LOST where parts are missing: what they are worth is asked, not noticed."""
+    usual = FollowerConfig()
+    if memory is Memory.FULL:
+        return usual
+    return replace(usual, lost=replace(usual.lost, stop=1.0))
 
 
 @functools.cache

@@ -9,6 +9,7 @@ from cbe_runtime.route import AttractorPrecision
 if TYPE_CHECKING:
     from cbe_bench.drives import Drives
     from cbe_bench.evaluation import RunConfig
+    from cbe_bench.route import Teaching
 
 
 def add_run(parser: argparse.ArgumentParser) -> None:
@@ -55,10 +56,37 @@ def add_behaviors(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_journeys(parser: argparse.ArgumentParser) -> None:
+def add_teaching(parser: argparse.ArgumentParser) -> None:
+    """How long drives are cut and stored."""
+    parser.add_argument(
+        "--segment-steps", type=int, metavar="K", help="longest segment (the model's own)"
+    )
+    parser.add_argument(
+        "--precision", type=AttractorPrecision, choices=list(AttractorPrecision),
+        default=AttractorPrecision.U8, metavar="f32|u8|u4",
+        help="of attractors; with f32 embeddings are f32 too, else f16 (%(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--adaptive", action="store_true",
+        help="put joints where the view pins the place best, in place of equal segments",
+    )  # fmt: skip
+
+
+def teaching(options: argparse.Namespace) -> "Teaching":
+    """How routes are taught.
+
+    Raises:
+        ConfigError: they cannot be.
+    """
+    from cbe_bench.route import Teaching, precision_of
+
+    return Teaching(options.segment_steps, precision_of(options.precision), options.adaptive)
+
+
+def add_journeys(parser: argparse.ArgumentParser, length_m: float = 20.0) -> None:
     """Runs of long drives."""
     parser.add_argument(
-        "--length-m", type=float, default=20.0, metavar="M", help="about so long (%(default)s)"
+        "--length-m", type=float, default=length_m, metavar="M", help="about so long (%(default)s)"
     )
     add_run(parser)
     parser.add_argument(

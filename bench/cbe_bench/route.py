@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,17 +16,48 @@ from cbe_runtime.teach import Teacher
 
 
 @dataclass(frozen=True, slots=True)
-class RouteConfig:
-    """A run of `cbe-bench route`; `segment_steps` of None takes the model's own K."""
+class Teaching:
+    """How drives become routes; `segment_steps` of None takes the model's own K."""
 
-    run: RunConfig
     segment_steps: int | None = None
     precision: Precision = field(default_factory=Precision)
+    adaptive: bool = False
 
     def __post_init__(self) -> None:
         """Refuse what cannot be taught."""
         if self.segment_steps is not None and self.segment_steps < 1:
             raise ConfigError(f"a segment has at least 1 step, found {self.segment_steps}")
+
+    def __call__(self, networks: Networks, views: Sequence[NDArray[np.uint8]]) -> Route:
+        """The route of a drive's views (64, 64, 3), one a step."""
+        teacher = Teacher(
+            networks,
+            MODEL_CAMERA,
+            segment_steps=self.segment_steps,
+            total_steps=len(views) - 1,
+            precision=self.precision,
+            adaptive=self.adaptive,
+        )
+        for view in views:
+            teacher.feed(view)
+        return teacher.finish()
+
+    def to_dict(self) -> dict[str, Any]:
+        """What the result's `config` holds."""
+        return {
+            "segment_steps": self.segment_steps,
+            "precision": self.precision.attractor.value,
+            "embedding_precision": self.precision.embedding.value,
+            "adaptive": self.adaptive,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class RouteConfig:
+    """A run of `cbe-bench route`."""
+
+    run: RunConfig
+    teaching: Teaching = field(default_factory=Teaching)
 
 
 def precision_of(attractors: AttractorPrecision) -> Precision:
@@ -36,43 +67,18 @@ def precision_of(attractors: AttractorPrecision) -> Precision:
 
 
 def run(config: RouteConfig, label: str = "routes") -> Evaluation:
-    """Drive all episodes, each drive taught in equal segments; raises CbeError as `evaluate`."""
-    longest = config.segment_steps or Networks.load(config.run.model).segment_steps
-    teaching = partial(teach, segment_steps=longest, precision=config.precision)
+    """Drive all episodes; raises CbeError as `evaluate`."""
+    teaching = config.teaching
+    longest = teaching.segment_steps or Networks.load(config.run.model).segment_steps
     done = evaluate(config.run, teaching, label)
     stored = [trace.stored for trace in done.traces]
-    how = {
-        "segment_steps": longest,
-        "precision": config.precision.attractor.value,
-        "embedding_precision": config.precision.embedding.value,
-    }
     summary = done.summary | memory(stored)
-    summary["config"] |= how
+    summary["config"] |= teaching.to_dict() | {"segment_steps": longest}
     summary["runs"] = [
         each | {"route": asdict(route)}
         for each, route in zip(done.summary["runs"], stored, strict=True)
     ]
     return Evaluation(summary, done.traces)
-
-
-def teach(
-    networks: Networks,
-    views: Sequence[NDArray[np.uint8]],
-    *,
-    segment_steps: int,
-    precision: Precision,
-) -> Route:
-    """The route of a drive's views (64, 64, 3), one a step, in equal segments."""
-    teacher = Teacher(
-        networks,
-        MODEL_CAMERA,
-        segment_steps=segment_steps,
-        total_steps=len(views) - 1,
-        precision=precision,
-    )
-    for view in views:
-        teacher.feed(view)
-    return teacher.finish()
 
 
 def memory(stored: Sequence[Stored]) -> dict[str, float]:

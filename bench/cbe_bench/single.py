@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cbe_bench import route
 from cbe_bench.evaluation import Evaluation, RunConfig, evaluate
+from cbe_bench.route import Teaching
 from cbe_runtime.networks import Networks
-from cbe_runtime.route import Precision, Route
+from cbe_runtime.route import Route
 
 
 def run(config: RunConfig, label: str = "episodes") -> Evaluation:
@@ -19,4 +19,4 @@ def run(config: RunConfig, label: str = "episodes") -> Evaluation:
 def teach(networks: Networks, views: Sequence[NDArray[np.uint8]]) -> Route:
     """The route of a drive's views (64, 64, 3), one a step, as a single behavior."""
     # One more than the drive's steps, for the teacher rounds down to whole network periods.
-    return route.teach(networks, views, segment_steps=len(views), precision=Precision())
+    return Teaching(len(views))(networks, views)

@@ -5,13 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from cbe.camera import MODEL_CAMERA
-from cbe.signature import ATTRACTOR_SIZE, EMBEDDING_SIZE
-from cbe_bench import evaluation, route, scenario
+from cbe_bench import route
 from cbe_bench.cli import main
 from cbe_bench.evaluation import Stored
 from cbe_runtime import routefile
-from cbe_runtime.networks import Networks, Prediction
 from cbe_runtime.route import AttractorPrecision, EmbeddingPrecision
 
 PROMISED = {
@@ -20,49 +17,7 @@ PROMISED = {
 }  # fmt: skip
 LENGTH_M = 6.0
 
-
-class Counting:
-    """Stands for `Networks`: drives ahead, a behavior being done after `ticks` ticks.
-
-    Keeps whether the attractors it was given at start and goal of a behavior were there.
-    """
-
-    model_id = "0011223344556677"
-    network_period = 2
-    segment_steps = 60
-    camera = MODEL_CAMERA
-    ticks = 10
-
-    def __init__(self):
-        self.given = []
-
-    def encoder_state(self):
-        return None
-
-    def generator_state(self):
-        return 0
-
-    def encode(self, image, state):
-        return np.zeros((1, 1), np.float32), np.ones(EMBEDDING_SIZE, np.float32), None
-
-    def attract(self, features):
-        return np.ones(ATTRACTOR_SIZE, np.float32)
-
-    def generate(self, *, state, attractor_start, attractor_goal, **others):
-        if state == 0:
-            self.given.append((bool(attractor_start.any()), bool(attractor_goal.any())))
-        progress = 1.0 if state >= self.ticks else 0.0
-        return Prediction(np.array([0.3, 0.0]), progress, 1.0), state + 1
-
-
-@pytest.fixture(autouse=True)
-def counting(monkeypatch):
-    networks = Counting()
-    monkeypatch.setattr(scenario, "GROUP", 2)
-    monkeypatch.setattr(evaluation, "GROUP", 2)
-    monkeypatch.setattr(Networks, "load", classmethod(lambda cls, folder: networks))
-    yield networks
-    evaluation._networks.cache_clear()
+pytestmark = pytest.mark.usefixtures("counting")
 
 
 def run(folder, *options, command="route"):
@@ -77,12 +32,12 @@ def view(value):
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_route_writes_the_promised_keys(tmp_path, capsys) -> None:
+def test_route_writes_the_promised_keys(tmp_path, capsys, counting) -> None:
     result = run(tmp_path, "--obstacles", "1", "--plot", str(tmp_path / "sheet.png"))
     assert result.keys() >= PROMISED
     assert json.loads(capsys.readouterr().out).keys() == result.keys() - {"runs"}
     assert result["episodes"] == sum(result["outcomes"].values()) == len(result["runs"]) == 2
-    assert result["config"]["segment_steps"] == Counting.segment_steps
+    assert result["config"]["segment_steps"] == counting.segment_steps
     assert result["config"]["obstacles"] == 1
     assert abs(result["length_mean_m"] - LENGTH_M) < 0.25 * LENGTH_M
     assert (tmp_path / "sheet.png").stat().st_size > 1000
@@ -99,7 +54,7 @@ def test_size_is_that_of_the_whole_file(counting) -> None:
     views = [view(i) for i in range(91)]
     for attractor in AttractorPrecision:
         precision = route.precision_of(attractor)
-        taught = route.teach(counting, views, segment_steps=30, precision=precision)
+        taught = route.Teaching(30, precision)(counting, views)
         least = 4 * attractor.size_bytes + 3 * precision.embedding.size_bytes
         assert least < len(routefile.dump(taught)) < least + 250
 
