@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from cbe_runtime.likeness import unlikeness
+from cbe_runtime.sight import Sight
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
@@ -20,12 +23,26 @@ class Behavior:
         self._start = route.attractor(segment)
         self._goal = route.attractor(segment + 1)
         self._embedding_goal = route.embedding(segment)
-        self._first: NDArray[np.float32] | None = None
-        self._encoder_state = networks.encoder_state()
         self._generator_state = networks.generator_state()
+        self.sight: Sight | None = None  # what was seen last
         self.segment = segment
         self.steps = route.segments[segment].steps
         self.last = segment + 1 == len(route.segments)
+
+    @property
+    def unlike_goal(self) -> float:
+        """How unlike its end the last view is, as `likeness.unlikeness`; 0 where that is unknown.
+
+        A memory without attractors holds zeros in their place.
+        """
+        if self.sight is None or not self._goal.any():
+            return 0.0
+        return float(unlikeness(self.sight.attractor, self._goal))
+
+    @property
+    def fresh(self) -> bool:
+        """Whether it has seen no frame yet."""
+        return self.sight is None
 
     def tick(self, image: NDArray[np.uint8]) -> Prediction:
         """One tick of all networks on the next frame (64, 64, 3) uint8 RGB.
@@ -33,20 +50,22 @@ class Behavior:
         Raises:
             ModelError: an output is not finite; the state is then as before.
         """
-        networks = self._networks
-        features, embedding, encoder_state = networks.encode(image, self._encoder_state)
-        attractor = networks.attract(features)
-        first = attractor if self._first is None else self._first
-        prediction, generator_state = networks.generate(
-            attractor_now=attractor,
-            attractor_first=first,
+        return self.follow(Sight.of(self._networks, image, self.sight))
+
+    def follow(self, sight: Sight) -> Prediction:
+        """One tick of the generator on what the encoder, shared with others, has just seen.
+
+        Raises:
+            ModelError: an output is not finite; the state is then as before.
+        """
+        prediction, self._generator_state = self._networks.generate(
+            attractor_now=sight.attractor,
+            attractor_first=sight.first,
             attractor_start=self._start,
             attractor_goal=self._goal,
-            embedding_now=embedding,
+            embedding_now=sight.embedding,
             embedding_goal=self._embedding_goal,
             state=self._generator_state,
         )
-        self._first = first
-        self._encoder_state = encoder_state
-        self._generator_state = generator_state
+        self.sight = sight
         return prediction

@@ -45,6 +45,11 @@ def replay_main(arguments: Arguments = None) -> int:
     return _run("cbe-replay", "command_replay", arguments)
 
 
+def view_main(arguments: Arguments = None) -> int:
+    """`cbe-view`: show a robot live."""
+    return _run("cbe-view", "command_view", arguments)
+
+
 def route_main(arguments: Arguments = None) -> int:
     """`cbe-route`: look into a route."""
     return _run("cbe-route", "command_route", arguments)

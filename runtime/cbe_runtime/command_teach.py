@@ -5,18 +5,20 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
+from contextlib import suppress
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING
 
-from cbe.errors import ConfigError
+from cbe.errors import ConfigError, ModelError
 from cbe.link import Link
-from cbe_runtime import forecast, lint, routefile
+from cbe_runtime import budget, forecast, lint, routefile
 from cbe_runtime import options as shared
 from cbe_runtime.command_runtime import exit_on_signals
 from cbe_runtime.drive import RecordedDrive
 from cbe_runtime.live import LiveDrive
 from cbe_runtime.networks import Networks
+from cbe_runtime.pathshape import PathShape
 from cbe_runtime.perturb import PERTURBATIONS, TURNS
 from cbe_runtime.progressbar import track
 from cbe_runtime.route import Precision
@@ -49,6 +51,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="K",
         help="longest segment in steps of 0.1 s (default: the model's)",
     )
+    parser.add_argument(
+        "--adaptive",
+        action="store_true",
+        help="put joints where the view pins the place best, in place of equal segments",
+    )
+    parser.add_argument(
+        "--budget",
+        metavar="N B/m",
+        help="choose segments and precision so that the route takes no more bytes a metre, as in "
+        "100B/m; the drive's length is read off its embeddings",
+    )
     parser.add_argument("--name", help="name to store in the route")
     parser.add_argument(
         "--lint",
@@ -72,9 +85,19 @@ def run(options: argparse.Namespace) -> int:
         raise ConfigError("give either a recording or --live")
     if options.segment_steps is not None and options.segment_steps < 2:
         raise ConfigError(f"--segment-steps must be 2 or more; found {options.segment_steps}")
+    bytes_per_m = None if options.budget is None else budget.parse(options.budget)
+    if options.budget is not None and (options.live or options.segment_steps or options.adaptive):
+        raise ConfigError(
+            "--budget chooses the segments of a recorded drive, whose length can be known: leave "
+            "out --live, --segment-steps and --adaptive"
+        )
     networks = Networks.load(options.model)
+    routefile.require_writable(options.output)  # a drive is not to be lost for a full disk
     drive = None if options.live else _open(options)
-    route = _live(options, networks) if drive is None else _recorded(options, networks, drive)
+    if drive is None:
+        route = _live(options, networks)
+    else:
+        route = _recorded(options, networks, drive, bytes_per_m)
     size = routefile.save(route, options.output)
     sys.stdout.write(
         f"{options.output}: {size} bytes, {route.steps} steps in {len(route.segments)} segments, "
@@ -106,9 +129,36 @@ def _look_over(
         logger.warning("the route may fail: cbe-route lint says where; consider another drive")
 
 
-def _recorded(options: argparse.Namespace, networks: Networks, drive: RecordedDrive) -> Route:
+def _recorded(
+    options: argparse.Namespace,
+    networks: Networks,
+    drive: RecordedDrive,
+    bytes_per_m: float | None,
+) -> Route:
     # Equal segments need the drive's length: one pass to count, one to teach.
     frames = sum(1 for _ in track(drive.frames(), "counting frames"))
+    route = _taught(options, networks, drive, frames)
+    if bytes_per_m is not None:
+        shape = None
+        with suppress(ModelError):  # older models cannot read a path off an embedding
+            shape = PathShape.load(options.model)
+        length_m, source = budget.length_m(route, shape)
+        plan = budget.plan(route, length_m, bytes_per_m, networks.segment_steps)
+        sys.stdout.write(
+            f"{length_m:.1f} m ({source}), {plan.size_bytes / length_m:.0f} B/m: segments of "
+            f"{plan.segment_steps} steps, attractors {plan.precision.attractor}, embeddings "
+            f"{plan.precision.embedding}\n"
+        )
+        options.segment_steps = plan.segment_steps
+        options.attractors = plan.precision.attractor
+        options.embeddings = plan.precision.embedding
+        route = _taught(options, networks, drive, frames)
+    return route
+
+
+def _taught(
+    options: argparse.Namespace, networks: Networks, drive: RecordedDrive, frames: int
+) -> Route:
     teacher = _teacher(options, networks, View(drive.camera), total_steps=frames - 1)
     for image in track(drive.frames(), "teaching", frames):
         teacher.feed(image)
@@ -148,6 +198,7 @@ def _teacher(
         segment_steps=options.segment_steps,
         total_steps=total_steps,
         precision=Precision(options.attractors, options.embeddings),
+        adaptive=options.adaptive,
     )
 
 

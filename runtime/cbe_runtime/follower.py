@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections import deque
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,12 +15,17 @@ from cbe.robot import STEP_S, Robot
 from cbe.signature import OVERRUN_M
 from cbe.stop_zone import limit
 from cbe_runtime.behavior import Behavior
-from cbe_runtime.observation import Observation, StampWatch, usable_image, usable_ranges
+from cbe_runtime.caution import slowed
+from cbe_runtime.joining import JoinConfig, Search, Whereabouts, advice
+from cbe_runtime.lost import LostBelief, LostConfig
+from cbe_runtime.observation import Observation, StampWatch, newer, usable_image, usable_ranges
+from cbe_runtime.plausible import PictureWatch, ReturnWatch
 from cbe_runtime.state import Events, Reason, State, StateMachine
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from cbe_runtime.joining import Hypothesis
     from cbe_runtime.networks import Networks, Prediction
     from cbe_runtime.observation import Frame
     from cbe_runtime.route import Route
@@ -40,6 +46,8 @@ class FollowerConfig:
     progress_ticks: int = 2  # network ticks in a row that must agree, against flicker
     timeout_factor: float = 3.0  # a segment may take this many times the demonstration's steps
     timeout_steps: int = 100  # ... and this many more
+    lost: LostConfig = field(default_factory=LostConfig)
+    join: JoinConfig = field(default_factory=JoinConfig)
 
     def ends(self, prediction: Prediction, *, last: bool) -> bool:
         """Whether a tick says that the behavior, the route's last or another, is done."""
@@ -51,12 +59,28 @@ class FollowerConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class Asked:
+    """What was asked of the follower between two steps.
+
+    `relocalise` is a start anywhere on the route, `near` where the robot is thought to be.
+    """
+
+    start: bool = False
+    stop: bool = False
+    relocalise: bool = False
+    near: Whereabouts | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Decision:
     """What to command in this step, and why.
 
     `progress` is of the present segment; `waypoint_m` (x, y) in base_link at the present pose;
     ages are since receipt, inf where nothing was received; `standing` is the robot's own belief
-    (the command and the braking that precedes it), `ticked` whether the networks ran.
+    (the command and the braking that precedes it), `ticked` whether the networks ran. `lost` is
+    the probability of being lost, `place` where the robot most likely is, if that is known.
+    `gap_steps` is how many steps the robot may have driven between the last two frames that the
+    networks saw: they are trained on 1 to 3.
     """
 
     speed_mps: float
@@ -72,6 +96,9 @@ class Decision:
     scan_age_s: float
     standing: bool
     ticked: bool
+    lost: float = 0.0
+    place: Whereabouts | None = None
+    gap_steps: int = 0
 
 
 class Follower:
@@ -101,15 +128,21 @@ class Follower:
             self._config.fresh_s, Reason.STALE_CAMERA, Reason.FROZEN_CAMERA
         )
         self._scan_watch = StampWatch(self._config.fresh_s, Reason.STALE_SCAN, Reason.FROZEN_SCAN)
+        self._picture_watch = PictureWatch(self._config.fresh_s)
+        self._return_watch = ReturnWatch()
         self._machine = StateMachine()
-        self._start = False
-        self._stop = False
+        self._asking: deque[Asked] = deque()  # filled by other threads
+        self.asked = Asked()
+        """What the last step was asked."""
         self._motion = Motion(np.zeros(1), np.zeros(1))
         self._command = (0.0, 0.0)  # m/s, rad/s
         self._behavior = Behavior(networks, route, 0)
+        self._belief = LostBelief(self._config.lost)
+        self._search: Search | None = None
         self._age_steps = 0  # steps spent on the present segment
         self._done_ticks = 0  # ticks in a row that called it done
         self._since_tick_steps = networks.network_period
+        self._gap_steps = 0  # between the last two ticks
         self._seen_stamp_ns: int | None = None
         self._prediction: Prediction | None = None
         self._waypoint_m: tuple[float, float] | None = None  # at the present pose
@@ -124,13 +157,33 @@ class Follower:
         """The state after the last step."""
         return self._machine.state
 
+    @property
+    def segments(self) -> int:
+        """Of the route."""
+        return len(self._route.segments)
+
+    @property
+    def advice(self) -> str | None:
+        """What a person can do for the robot, where it is LOST."""
+        if self._machine.state is not State.LOST:
+            return None
+        return advice(self._place(), self._route)
+
     def start(self) -> None:
         """Ask to follow the route."""
-        self._start = True
+        self._asking.append(Asked(start=True))
 
     def stop(self) -> None:
         """Ask to stop until the next start; wins over a start asked for in the same step."""
-        self._stop = True
+        self._asking.append(Asked(stop=True))
+
+    def ask(self, asked: Asked) -> None:
+        """Ask for what was asked of another follower."""
+        self._asking.append(asked)
+
+    def relocalise(self, near: Whereabouts | None = None) -> None:
+        """Ask to look for the robot's place on the route, first `near` a place, and to go on."""
+        self._asking.append(Asked(relocalise=True, near=near))
 
     def step(self, observation: Observation, now_s: float) -> Decision:
         """Decide what to command for the next 0.1 s; call once a step.
@@ -139,22 +192,37 @@ class Follower:
             observation: newest frame and scan.
             now_s: on the clock of their `received_s`.
         """
+        self.asked = asked = self._take_asked()
         self._carry_waypoint()
         image, ranges_m, fault = self._judge(observation, now_s)
-        if self._start and self._machine.state in {State.IDLE, State.ARRIVED}:
+        before = self._machine.state
+        if asked.start and before not in {State.FOLLOWING, State.STOPPED}:
             self._restart()
-        elif self._start:
+        elif asked.start:
             self._age_steps = 0
-        self._machine.update(Events(start=self._start, stop=self._stop, fault=fault))
-        self._start = self._stop = False
+        self._machine.update(Events(asked.start, asked.stop, fault, relocalise=asked.relocalise))
+        state = self._machine.state
+        if state is State.JOINING and (asked.relocalise or before is not State.JOINING):
+            self._seek(asked.near)
 
         ticked = False
-        if self._machine.state is State.FOLLOWING:
+        if state in {State.FOLLOWING, State.LOST, State.JOINING}:
             assert image is not None
             assert observation.frame is not None
-            ticked = self._follow(image, observation.frame)
-        self._move(ranges_m)
+            tick = self._follow if state is State.FOLLOWING else self._look_for_place
+            ticked = tick(image, observation.frame)
+        self._move(ranges_m, now_s)
         return self._decision(observation, now_s, ticked)
+
+    def _take_asked(self) -> Asked:
+        asked = [self._asking.popleft() for _ in range(len(self._asking))]
+        hints = [each.near for each in asked if each.relocalise]
+        return Asked(
+            any(each.start for each in asked),
+            any(each.stop for each in asked),
+            bool(hints),
+            hints[-1] if hints else None,
+        )
 
     def _judge(
         self, observation: Observation, now_s: float
@@ -167,33 +235,49 @@ class Follower:
         ranges_m = None if scan_fault or scan is None else usable_ranges(scan, self._robot)
         if image is None:
             return image, ranges_m, camera_fault or Reason.BAD_IMAGE
-        if ranges_m is None:
-            return image, ranges_m, scan_fault or Reason.BAD_SCAN
-        return image, ranges_m, None
+        if ranges_m is None or not self._return_watch.plausible(ranges_m):
+            return image, None, scan_fault or Reason.BAD_SCAN
+        assert frame is not None
+        fault = self._picture_watch.fault(frame, image, ranges_m, self._command[0], now_s)
+        return image, ranges_m, fault
 
     def _follow(self, image: NDArray[np.uint8], frame: Frame) -> bool:
         """Run the networks if they are due; tells whether they ran."""
         self._age_steps += 1
-        self._since_tick_steps += 1
         config = self._config
         if self._age_steps > config.timeout_factor * self._behavior.steps + config.timeout_steps:
             self._machine.update(Events(fault=Reason.TIMEOUT))
             return False
-        # A frame is seen once, however often it is delivered: the encoder counts frames.
-        due = self._since_tick_steps >= self._networks.network_period
-        if not due or frame.stamp_ns == self._seen_stamp_ns:
+        if not self._due(frame):
             return False
         try:
             prediction = self._behavior.tick(image)
         except ModelError:
             self._machine.update(Events(fault=Reason.MODEL_FAULT))
             return False
-        self._since_tick_steps = 0
+        self._ticked(frame, prediction)
+        self._belief.update(prediction.on_route)
+        self._judge_progress(prediction)
+        if self._belief.lost and self._machine.state is State.FOLLOWING:
+            self._lose()
+        return True
+
+    def _due(self, frame: Frame) -> bool:
+        """Whether the networks are to run on this frame; call once a step."""
+        self._since_tick_steps += 1
+        # A frame is seen once and in order, however it is delivered: the encoder counts frames.
+        due = self._since_tick_steps >= self._networks.network_period
+        new = self._camera_watch.newest(frame) and newer(frame.stamp_ns, self._seen_stamp_ns)
+        return due and new and self._picture_watch.shows
+
+    def _ticked(self, frame: Frame, prediction: Prediction | None) -> None:
+        """Keep what a tick on the frame said, if anything."""
+        self._gap_steps, self._since_tick_steps = self._since_tick_steps, 0
         self._seen_stamp_ns = frame.stamp_ns
         self._prediction = prediction
-        self._waypoint_m = (float(prediction.waypoint_m[0]), float(prediction.waypoint_m[1]))
-        self._judge_progress(prediction)
-        return True
+        self._waypoint_m = None
+        if prediction is not None:
+            self._waypoint_m = (float(prediction.waypoint_m[0]), float(prediction.waypoint_m[1]))
 
     def _judge_progress(self, prediction: Prediction) -> None:
         """Start the next behavior, or arrive, once enough ticks in a row say so."""
@@ -202,10 +286,59 @@ class Follower:
         self._done_ticks = self._done_ticks + 1 if done else 0
         if self._done_ticks < self._config.progress_ticks:
             return
-        if last:
-            self._machine.update(Events(arrived=True))
-        else:
+        as_remembered = self._behavior.unlike_goal <= self._config.lost.unlike_end
+        if not as_remembered:
+            self._belief.contradict()
+        if not last:
             self._begin(self._behavior.segment + 1)
+        elif as_remembered:
+            self._machine.update(Events(arrived=True))
+
+    def _lose(self) -> None:
+        """Stand, and look for the place."""
+        self._machine.update(Events(lost=True))
+        self._seek(None)
+
+    def _seek(self, near: Whereabouts | None) -> None:
+        """Begin to look for the robot's place."""
+        self._search = Search(
+            self._networks, self._route, self._config.lost, self._config.join, near
+        )
+        self._prediction = None
+        self._waypoint_m = None
+
+    def _look_for_place(self, image: NDArray[np.uint8], frame: Frame) -> bool:
+        """A tick of the search if it is due; tells whether the networks ran."""
+        search = self._search
+        assert search is not None
+        if not self._due(frame) or (search.standing and self._motion.speed_mps[0] > 0.0):
+            return False
+        try:
+            if search.failed and search.elsewhere(image):
+                self._seek(None)  # somebody moved the robot
+            elif not search.failed:
+                search.look(image)
+        except ModelError:
+            self._machine.update(Events(fault=Reason.MODEL_FAULT))
+            return False
+        self._ticked(frame, search.prediction)
+        if search.failed:
+            if search.hinted:
+                self._seek(None)
+            else:
+                self._machine.update(Events(lost=True))
+        elif self._machine.state is State.LOST and not search.standing:
+            self._machine.update(Events(found=True))
+        elif search.found is not None:
+            self._join(search.found)
+        return True
+
+    def _join(self, hypothesis: Hypothesis) -> None:
+        """Go on with a behavior that the robot was found to be on."""
+        self._behavior, self._belief = hypothesis.behavior, hypothesis.belief
+        self._done_ticks = 0
+        self._age_steps = 0
+        self._machine.update(Events(found=True))
 
     def _begin(self, segment: int) -> None:
         """Enter a segment with every recurrent state reset; its first frame is the next one."""
@@ -219,14 +352,16 @@ class Follower:
         """Forget everything and stand before the route's first segment."""
         self._prediction = None
         self._waypoint_m = None
+        self._search = None
+        self._belief = LostBelief(self._config.lost)
         self._seen_stamp_ns = None
         self._since_tick_steps = self._networks.network_period
         self._begin(0)
 
-    def _move(self, ranges_m: NDArray[np.float64] | None) -> None:
+    def _move(self, ranges_m: NDArray[np.float64] | None, now_s: float) -> None:
         """Set the motion commanded for this step."""
         state = self._machine.state
-        driving = state in {State.FOLLOWING, State.ARRIVED}
+        driving = state in {State.FOLLOWING, State.ARRIVED, State.JOINING}
         if not driving or ranges_m is None or self._waypoint_m is None:
             # The command is zero at once; the estimate follows the robot's own braking.
             braked = self._motion.speed_mps - self._robot.max_braking_mps2 * STEP_S
@@ -238,6 +373,12 @@ class Follower:
             motion = self._controller.step(self._motion, goal_m, scan_m)
             if state is State.ARRIVED:
                 motion = self._coast(motion)
+            elif state is State.JOINING:
+                creep_mps = np.minimum(motion.speed_mps, self._config.join.creep_mps)
+                motion = Motion(creep_mps, motion.steer_rad)
+            age_s = max(self._camera_watch.age_s(now_s), self._scan_watch.age_s(now_s))
+            speed_mps = float(self._motion.speed_mps[0])
+            motion = slowed(motion, speed_mps, age_s, self._config.fresh_s, self._robot)
             self._motion = limit(motion, scan_m, self._robot)
             speed, yaw_rate = twist(self._motion, self._robot)
             self._command = (float(speed[0]), float(yaw_rate[0]))
@@ -279,4 +420,16 @@ class Follower:
             scan_age_s=now_s - scan.received_s if scan else math.inf,
             standing=float(self._motion.speed_mps[0]) <= 0.0,
             ticked=ticked,
+            gap_steps=self._gap_steps if ticked else 0,
+            lost=self._belief.probability,
+            place=self._place(),
         )
+
+    def _place(self) -> Whereabouts | None:
+        """Where the robot most likely is."""
+        if self._machine.state in {State.LOST, State.JOINING} and self._search is not None:
+            return self._search.place
+        if self._prediction is None:
+            return None
+        progress = self._prediction.progress
+        return Whereabouts(self._behavior.segment, progress, 1.0 - self._belief.probability)

@@ -19,12 +19,17 @@ MAX_INVALID_RAYS = 0.5
 """Share of NaN rays up to which the neighbours stand in for them."""
 
 
+CLOCK_SET_NS = 1_000_000_000
+"""A stamp further back than this is of a clock that was set; a nearer one of an older frame."""
+
+
 @dataclass(frozen=True, slots=True)
 class Frame:
     """The newest camera frame in the model's view.
 
     `image` is (64, 64, 3) uint8 RGB, or None where one was received but could not be decoded;
-    `received_s` is the local monotonic time of receipt; `stamp_ns` the sender's capture time.
+    `received_s` is the local monotonic time of receipt, or of capture where clocks are known to
+    agree; `stamp_ns` the sender's capture time, negative for what could not be decoded.
     """
 
     image: NDArray[np.uint8] | None
@@ -53,10 +58,22 @@ class Observation:
     scan: Scan | None
 
 
+def newer(stamp_ns: int, than_ns: int | None) -> bool:
+    """Whether a sample was taken after another: not if it is the same, or was overtaken.
+
+    A clock may be set, forwards or back by more than a second: what comes then is newer too.
+    """
+    if than_ns is None or stamp_ns < 0:
+        return stamp_ns != than_ns
+    ahead_ns = stamp_ns - than_ns
+    return ahead_ns > 0 or ahead_ns < -CLOCK_SET_NS
+
+
 class StampWatch:
     """Tells a sensor that fell silent from one that keeps repeating itself.
 
-    Silence shows in the local receipt time, a frozen sensor in a stamp that stands still.
+    Silence shows in the local receipt time, a frozen sensor in a stamp that stands still or
+    only falls behind.
     """
 
     def __init__(self, fresh_s: float, stale: Reason, frozen: Reason) -> None:
@@ -70,7 +87,7 @@ class StampWatch:
         """Judge the newest sample; call once a step."""
         if sample is None:
             return self._stale
-        if sample.stamp_ns != self._stamp_ns:
+        if newer(sample.stamp_ns, self._stamp_ns):
             self._stamp_ns = sample.stamp_ns
             self._advanced_s = sample.received_s
         if now_s - sample.received_s > self._fresh_s:
@@ -78,6 +95,14 @@ class StampWatch:
         if now_s - self._advanced_s > self._fresh_s:
             return self._frozen
         return None
+
+    def newest(self, sample: Frame | Scan) -> bool:
+        """Whether nothing newer than this sample, or a copy of it, was ever judged."""
+        return sample.stamp_ns == self._stamp_ns
+
+    def age_s(self, now_s: float) -> float:
+        """Since the newest sample came, however often it, or an older one, came again."""
+        return now_s - self._advanced_s
 
 
 def usable_image(frame: Frame) -> NDArray[np.uint8] | None:

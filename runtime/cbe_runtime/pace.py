@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import TYPE_CHECKING, Protocol
 
@@ -12,9 +13,11 @@ if TYPE_CHECKING:
     from cbe_runtime.observation import Observation
     from cbe_runtime.sensors import Sensors
 
-LEAD_S = 0.004
-"""A tick aims at this long after its camera frame came: the frame's jitter, no more."""
-MAX_SHIFT_S = 0.02
+WINDOW_S = 0.025
+"""A tick goes with its camera frame if that comes this near to the deadline, before or after."""
+SHIFT = 0.25
+MAX_SHIFT_S = 0.005
+"""Deadlines slide to where the frames come: a twentieth of the period at most, never in bursts."""
 POLL_S = 0.05
 MAX_REPEATS = 3
 SCAN_PATIENCE_S = 1.0
@@ -24,50 +27,70 @@ class Pace(Protocol):
     """Decides when to tick."""
 
     overruns: int
+    jitter_s: float
+    """By how much the tick that is now due begins off its deadline."""
 
     def wait(self, observation: Observation) -> None:
         """Return when the tick after the one that saw `observation` is due."""
 
 
+class Camera(Protocol):
+    """What sets the pace; `Sensors` is one."""
+
+    @property
+    def frame_received_s(self) -> float:
+        """When the newest frame seen came, -inf before the first."""
+
+    def wait_for_frame_since(self, since_s: float, timeout_s: float) -> bool:
+        """Whether a frame came since some time, or does within the time to come."""
+
+
 class Ratekeeper:
     """Waits for absolute, monotonic deadlines; those missed by an overrun are skipped.
 
-    The deadlines' phase slides to just after the camera's frames:
-    else a frame would wait for its tick half a period on average.
+    Within a window round its deadline a tick goes with the camera's frame, at the window's end
+    without one. A frame that just missed a tick would else wait a whole period for the next. The
+    deadlines' phase slides slowly to where the frames come.
     """
 
     def __init__(
-        self, period_s: float, exiting: Event, clock: Callable[[], float] = time.monotonic
+        self,
+        period_s: float,
+        exiting: Event,
+        camera: Camera,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Begin now; `exiting` ends every wait at once."""
         self._period_s = period_s
         self._exiting = exiting
+        self._camera = camera
         self._clock = clock
         self._due_s = clock()
+        self.jitter_s = 0.0
         self.overruns = 0
         """Deadlines that passed while a tick was still running."""
 
     def wait(self, observation: Observation) -> None:
-        """Return at the next deadline that lies ahead."""
-        began_s = self._due_s
-        self._due_s += self._period_s
-        if observation.frame is not None:
-            self._due_s -= self._shift(began_s - observation.frame.received_s)
+        """Return at the next deadline that lies ahead, or with the frame that comes near it."""
+        del observation  # it is the frame's time of receipt that counts
+        self._due_s += self._period_s - self._shift()
         late_s = self._clock() - self._due_s
-        if late_s > 0.0:
+        if late_s > WINDOW_S:
             missed = int(late_s // self._period_s) + 1
             self.overruns += missed
             self._due_s += missed * self._period_s
-        self._exiting.wait(max(self._due_s - self._clock(), 0.0))
+        opens_s, closes_s = self._due_s - WINDOW_S, self._due_s + WINDOW_S
+        if not self._exiting.wait(max(opens_s - self._clock(), 0.0)):
+            self._camera.wait_for_frame_since(opens_s, max(closes_s - self._clock(), 0.0))
+        self.jitter_s = abs(self._clock() - self._due_s)
 
-    def _shift(self, age_s: float) -> float:
-        """How much earlier to tick, from the frame's age at the last deadline."""
-        if not 0.0 <= age_s < self._period_s:
-            return 0.0
-        error_s = age_s - LEAD_S
-        if error_s > 0.5 * self._period_s:
-            error_s -= self._period_s  # the next frame is nearer than the last one
-        return max(-MAX_SHIFT_S, min(0.5 * error_s, MAX_SHIFT_S))
+    def _shift(self) -> float:
+        """How much earlier to tick, from when the frame of the last deadline came."""
+        early_s = self._due_s - self._camera.frame_received_s
+        if abs(early_s) > self._period_s:
+            return 0.0  # there is none, or it is an old one
+        error_s = math.remainder(early_s, self._period_s)
+        return max(-MAX_SHIFT_S, min(SHIFT * error_s, MAX_SHIFT_S))
 
 
 class LockStep:
@@ -92,6 +115,7 @@ class LockStep:
         self._patience_s = patience_s
         self._clock = clock
         self.overruns = 0
+        self.jitter_s = 0.0
 
     def wait(self, observation: Observation) -> None:
         """Return at the next new frame once its scan is there too, or when patience ends."""

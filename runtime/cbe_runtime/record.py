@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from threading import Event
 
     from cbe.link import Link
+    from cbe_runtime.blackbox import Ring
     from cbe_runtime.mcapfile import Recorder
 
 logger = logging.getLogger(__name__)
@@ -22,8 +23,12 @@ CAPACITY = 512
 """Messages a topic may wait for the disk: close to a minute at 10 Hz."""
 
 
+OWN = {"status": "cbe/Status", "decision": "cbe/Decision"}
+"""Types of our own JSON objects, by the names of their keys."""
+
+
 class Recording:
-    """Subscribes to camera, scan, calibration, odometry and commands when made."""
+    """Subscribes to camera, scan, calibration, odometry, commands and decisions when made."""
 
     def __init__(self, link: Link, unstamped: bool = False) -> None:
         commands = topics.CMD_VEL_UNSTAMPED if unstamped else topics.CMD_VEL
@@ -35,16 +40,24 @@ class Recording:
             topics.ODOM,
             commands,
         )
-        self._streams = [(topic, link.stream(topic, CAPACITY)) for topic in wanted]
+        self._streams = [
+            (f"/{topic.name}", topic.message.TYPE, link.stream(topic, CAPACITY)) for topic in wanted
+        ]
+        self._streams += [
+            (f"/cbe/{name}", type_name, link.stream_json(name, CAPACITY))
+            for name, type_name in OWN.items()
+        ]
         # Messages are dated by the wall clock, received by the monotonic one.
         self._wall_ns = time.time_ns() - time.monotonic_ns()
 
     @property
     def dropped(self) -> int:
         """Messages lost because the disk was too slow."""
-        return sum(stream.dropped for _, stream in self._streams)
+        return sum(stream.dropped for _, _, stream in self._streams)
 
-    def run(self, recorder: Recorder, ending: Event, duration_s: float | None = None) -> None:
+    def run(
+        self, recorder: Recorder | Ring, ending: Event, duration_s: float | None = None
+    ) -> None:
         """Write until `ending` is set or the time is over, and what has come till then.
 
         Raises:
@@ -59,13 +72,15 @@ class Recording:
         if self.dropped:
             logger.warning("%d messages were lost: the disk was too slow", self.dropped)
 
-    def _write(self, recorder: Recorder) -> None:
+    def _write(self, recorder: Recorder | Ring) -> None:
         """Empty the queues in the order of receipt."""
         batch = [
-            (sample.received_s, topic, sample.payload)
-            for topic, stream in self._streams
+            Recorded(
+                topic, type_name, sample.payload, self._wall_ns + round(1e9 * sample.received_s)
+            )
+            for topic, type_name, stream in self._streams
             for sample in stream.drain()
         ]
-        for received_s, topic, payload in sorted(batch, key=lambda each: each[0]):
-            log_time_ns = self._wall_ns + round(1e9 * received_s)
-            recorder.write(Recorded(f"/{topic.name}", topic.message.TYPE, payload, log_time_ns))
+        for message in sorted(batch, key=lambda each: each.log_time_ns):
+            recorder.write(message)
+        recorder.flush()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,14 +21,30 @@ from cbe_runtime.view import View
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from cbe.messages import CompressedImage, Image
     from cbe_runtime.drive import RecordedDrive
     from cbe_runtime.follower import Decision, Follower
 
 logger = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True, slots=True)
+class Replayed:
+    """A decision with what it was made from; `picture` is the camera's message."""
+
+    time_ns: int
+    decision: Decision
+    observation: Observation
+    picture: CompressedImage | Image | None
+
+
 def decisions(follower: Follower, drive: RecordedDrive, robot: Robot) -> Iterator[Decision]:
-    """One decision a step of the recording, the robot starting with the first frame.
+    """One decision a step of the recording, the robot starting with the first frame."""
+    return (each.decision for each in replay(follower, drive, robot))
+
+
+def replay(follower: Follower, drive: RecordedDrive, robot: Robot) -> Iterator[Replayed]:
+    """Each step of the recording, the robot starting with the first frame.
 
     Where the recording has no scan, nothing is taken to be in the way. Recorded motion is what
     it is: the follower's own commands change nothing about the next frame.
@@ -46,7 +63,7 @@ def decisions(follower: Follower, drive: RecordedDrive, robot: Robot) -> Iterato
                 logger.warning("left out a scan: %s", error)
         if message.topic != drive.topic or message.type_name not in IMAGE_TYPES:
             continue
-        image, stamp_ns = None, message.log_time_ns
+        image, decoded, stamp_ns = None, None, message.log_time_ns
         try:
             decoded = IMAGE_TYPES[message.type_name].from_cdr(message.data)
             stamp_ns = decoded.stamp_ns or stamp_ns
@@ -57,7 +74,8 @@ def decisions(follower: Follower, drive: RecordedDrive, robot: Robot) -> Iterato
             logger.warning("a frame is unusable: %s", error)
         now_s = step * STEP_S
         seen = Observation(Frame(image, now_s, stamp_ns), Scan(ranges_m, now_s, step))
-        yield follower.step(seen, now_s)
+        picture = None if image is None else decoded
+        yield Replayed(message.log_time_ns, follower.step(seen, now_s), seen, picture)
         step += 1
     if not scanned:
         logger.warning(

@@ -21,12 +21,15 @@ from cbe.errors import CbeError, RouteError
 from cbe_runtime.route import AttractorPrecision, EmbeddingPrecision, Precision, Route, Segment
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 MAGIC = "cbe-route"
 VERSION = 1
 MAX_FILE_BYTES = 8 * 2**20
 """Days of driving; read, checked and taken apart it stays within a board's memory."""
+USUAL_BYTES = 2**13
+"""A drive of some minutes."""
 MAX_SEGMENTS = 100_000
 MAX_TAGS = 64
 
@@ -184,12 +187,7 @@ def save(route: Route, path: Path) -> int:
         RouteError: the folder cannot be written.
     """
     data = dump(route)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
+    with _beside(path, data) as temporary:
         temporary.replace(path)
         # The rename itself is only safe once the folder is on disk too.
         folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
@@ -197,13 +195,40 @@ def save(route: Route, path: Path) -> int:
             os.fsync(folder)
         finally:
             os.close(folder)
+    return len(data)
+
+
+def require_writable(path: Path) -> None:
+    """Make sure before a long drive that a route of usual size can be saved there.
+
+    Raises:
+        RouteError: it cannot.
+    """
+    with _beside(path, bytes(USUAL_BYTES)):
+        pass
+
+
+@contextlib.contextmanager
+def _beside(path: Path, data: bytes) -> Iterator[Path]:
+    """A temporary file of these bytes in the same folder, on disk; gone at the end if still there.
+
+    Raises:
+        RouteError: it cannot be written, or what is done with it fails.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        yield temporary
     except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
         raise RouteError(
             f"cannot write the route {path}: {error.strerror}; free space or choose another folder"
         ) from error
-    return len(data)
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def _decode(data: bytes, into: type[Checked]) -> Checked:

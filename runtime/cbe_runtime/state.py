@@ -11,6 +11,8 @@ class State(StrEnum):
     FOLLOWING = "FOLLOWING"
     ARRIVED = "ARRIVED"
     STOPPED = "STOPPED"
+    LOST = "LOST"  # stands, does not know where it is, and looks for its place
+    JOINING = "JOINING"  # looks for its place, driving slowly where it seems to know it
 
 
 class Reason(StrEnum):
@@ -20,6 +22,7 @@ class Reason(StrEnum):
     STALE_CAMERA = "STALE_CAMERA"
     FROZEN_CAMERA = "FROZEN_CAMERA"
     BAD_IMAGE = "BAD_IMAGE"
+    BLANK_IMAGE = "BLANK_IMAGE"  # black, white, or of one colour all over
     STALE_SCAN = "STALE_SCAN"
     FROZEN_SCAN = "FROZEN_SCAN"
     BAD_SCAN = "BAD_SCAN"
@@ -34,51 +37,75 @@ class Reason(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Events:
-    """What happened since the last update; `fault` is what is wrong at present, if anything."""
+    """What happened since the last update; `fault` is what is wrong at present, if anything.
+
+    `relocalise` is a start anywhere on the route; `found` means that the robot's place is known,
+    in LOST that it is suspected; `lost` that it is not, or no longer.
+    """
 
     start: bool = False
     stop: bool = False
     fault: Reason | None = None
     arrived: bool = False
+    relocalise: bool = False
+    found: bool = False
+    lost: bool = False
 
 
 class StateMachine:
-    """IDLE -> FOLLOWING -> ARRIVED, with STOPPED (reason) beside FOLLOWING.
+    """IDLE -> FOLLOWING -> ARRIVED, with STOPPED (reason) and LOST -> JOINING beside FOLLOWING.
 
-    An operator's stop wins over everything, then a fault, then arrival. A transient fault ends
-    by itself; OPERATOR, MODEL_FAULT and TIMEOUT wait for a start.
+    An operator's stop wins over everything, then a fault, then being lost, then arrival. A
+    transient fault ends by itself; OPERATOR, MODEL_FAULT and TIMEOUT wait for a start. A robot
+    that did not know where it was when it stopped goes on by looking for its place.
     """
 
     def __init__(self) -> None:
         self.state = State.IDLE
         self.reason: Reason | None = None
+        self._placed = True  # whether STOPPED goes on to FOLLOWING, not to JOINING
 
     def update(self, events: Events) -> None:
         """Take the one transition that these events call for."""
+        starting = events.start or events.relocalise
         match self.state:
             case State.IDLE | State.ARRIVED:
                 if events.stop:
                     self._enter(State.IDLE)
-                elif events.start:
-                    self._follow_or_stop(events.fault)
-            case State.FOLLOWING:
-                if events.stop:
-                    self._enter(State.STOPPED, Reason.OPERATOR)
-                elif events.fault is not None:
-                    self._enter(State.STOPPED, events.fault)
-                elif events.arrived:
-                    self._enter(State.ARRIVED)
+                elif starting:
+                    self._go(events, placed=not events.relocalise)
+            case State.FOLLOWING | State.LOST | State.JOINING:
+                self._update_going(events)
             case State.STOPPED:
+                placed = self._placed and not events.relocalise
                 if events.stop:
-                    self._enter(State.STOPPED, Reason.OPERATOR)
-                elif events.start or (self.reason is not None and self.reason.transient):
-                    self._follow_or_stop(events.fault)
+                    self._stop(Reason.OPERATOR, placed=self._placed)
+                elif starting or (self.reason is not None and self.reason.transient):
+                    self._go(events, placed=placed)
 
-    def _follow_or_stop(self, fault: Reason | None) -> None:
-        if fault is None:
-            self._enter(State.FOLLOWING)
+    def _update_going(self, events: Events) -> None:
+        if events.stop:
+            self._stop(Reason.OPERATOR, placed=self.state is State.FOLLOWING)
+        elif events.relocalise or (events.start and self.state is not State.FOLLOWING):
+            self._go(events, placed=not events.relocalise)
+        elif events.fault is not None:
+            self._stop(events.fault, placed=self.state is State.FOLLOWING)
+        elif events.lost:
+            self._enter(State.LOST)
+        elif events.found:
+            self._enter(State.JOINING if self.state is State.LOST else State.FOLLOWING)
+        elif events.arrived and self.state is State.FOLLOWING:
+            self._enter(State.ARRIVED)
+
+    def _go(self, events: Events, *, placed: bool) -> None:
+        if events.fault is not None:
+            self._stop(events.fault, placed=placed)
         else:
-            self._enter(State.STOPPED, fault)
+            self._enter(State.FOLLOWING if placed else State.JOINING)
+
+    def _stop(self, reason: Reason, *, placed: bool) -> None:
+        self._placed = placed
+        self._enter(State.STOPPED, reason)
 
     def _enter(self, state: State, reason: Reason | None = None) -> None:
         self.state = state

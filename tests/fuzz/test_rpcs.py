@@ -78,6 +78,8 @@ class Session:
 class Follower:
     """Counts what it is told."""
 
+    segments = 3
+
     def __init__(self):
         self.told = []
 
@@ -86,6 +88,9 @@ class Follower:
 
     def stop(self):
         self.told.append("stop")
+
+    def relocalise(self, near=None):
+        self.told.append("relocalise")
 
 
 def attacks():
@@ -104,7 +109,7 @@ def test_hostile_call_is_answered_soon_and_small(fuzzed):
     session, follower = Session(), Follower()
     link = Link(session, LinkConfig())
     Loop(link, follower, None, LoopConfig(), threading.Event())
-    assert len(session.queryables) == 3
+    assert len(session.queryables) == 4
 
     def read(data):
         refusals = set()

@@ -91,13 +91,17 @@ def attractor_nodes(rng):
 
 
 def generator_nodes(ticks_to_goal, waypoint_m):
-    """Progress counts ticks since the behavior began; the waypoint is always straight ahead."""
+    """Progress counts ticks since the behavior began; the waypoint is always straight ahead.
+
+    It is always sure to be on the route.
+    """
     weights = {
         "one": np.float32([[1.0]]),
         "rate": np.full((STATE, 1), 1.0 / STATE / ticks_to_goal, np.float32),
         "ahead": np.float32([list(waypoint_m)]),
         "zero": np.float32([0.0]),
         "flat": np.array([1], np.int64),
+        "sure": np.float32([5.0]),
     }
     inputs = [t.name for t in signature.generator(STATE).inputs[:6]]
     nodes = [
@@ -109,7 +113,8 @@ def generator_nodes(ticks_to_goal, waypoint_m):
         helper.make_node("ReduceMean", ["all"], ["used"], axes=[1], keepdims=0),
         helper.make_node("Mul", ["used", "zero"], ["nothing"]),
         helper.make_node("Add", ["ahead", "nothing"], ["waypoint_m"]),
-        helper.make_node("Sigmoid", ["used"], ["on_route"]),
+        helper.make_node("Add", ["nothing", "sure"], ["on_route_logit"]),
+        helper.make_node("Sigmoid", ["on_route_logit"], ["on_route"]),
     ]
     return nodes, weights
 
@@ -160,17 +165,19 @@ def model_writer():
 
 @pytest.fixture
 def route(networks) -> Route:
-    """Two segments of 30 steps."""
+    """Two segments of 30 steps, the end of which looks plain grey."""
     rng = np.random.default_rng(1)
     precision = Precision()
+    grey = np.full((64, 64, 3), 90, np.uint8)
+    end = networks.attract(networks.encode(grey, networks.encoder_state())[0])
     return Route(
         model_id=networks.model_id,
         camera=networks.camera,
         network_period=networks.network_period,
         precision=precision,
         attractors=tuple(
-            precision.attractor.pack(rng.random(signature.ATTRACTOR_SIZE, np.float32))
-            for _ in range(3)
+            precision.attractor.pack(each)
+            for each in (*rng.random((2, signature.ATTRACTOR_SIZE), np.float32), end)
         ),
         segments=tuple(
             Segment(precision.embedding.pack(rng.random(signature.EMBEDDING_SIZE, np.float32)), 30)

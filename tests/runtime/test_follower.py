@@ -13,7 +13,7 @@ from cbe_runtime.observation import Frame, Observation, Scan
 from cbe_runtime.state import Reason, State
 
 ROBOT = Robot()
-IMAGE = np.full((64, 64, 3), 90, np.uint8)
+IMAGE = (85 + np.arange(64 * 64 * 3) % 11).astype(np.uint8).reshape(64, 64, 3)  # grey, grainy
 OPEN = np.full(ROBOT.scan_rays, np.inf, np.float32)
 
 
@@ -41,7 +41,8 @@ class Drive:
 
     def step(self, steps=1, **changed):
         for _ in range(steps):
-            seen = Observation(**({"frame": self.frame(), "scan": self.scan()} | changed))
+            frame = self.frame(np.roll(IMAGE, self.steps, axis=1))  # no camera's stands still
+            seen = Observation(**({"frame": frame, "scan": self.scan()} | changed))
             decision = self.follower.step(seen, self.now_s)
             self.steps += 1
         return decision
@@ -54,7 +55,7 @@ def drive(networks, route):
 
 def test_idle_until_started(networks, route):
     drive = Drive(follower := Follower(networks, route))
-    follower._start = False
+    follower._asking.clear()
     decision = drive.step()
     assert (decision.state, decision.speed_mps, decision.ticked) == (State.IDLE, 0.0, False)
 
@@ -93,7 +94,7 @@ def test_segment_switches_at_its_progress_and_resets_every_state(drive):
     decision = drive.step(2)
     assert decision.ticked
     assert decision.progress == pytest.approx(1 / 19.5)
-    assert drive.follower._behavior._encoder_state.h[0, 0] == 1
+    assert drive.follower._behavior.sight.state.h[0, 0] == 1
 
 
 def test_single_tick_of_high_progress_does_not_switch(drive, monkeypatch):

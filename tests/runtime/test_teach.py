@@ -90,3 +90,16 @@ def test_route_says_what_taught_it(networks):
 def test_drive_without_motion_is_refused(networks, frames):
     with pytest.raises(RouteError, match="at least two frames"):
         taught(networks, frames)
+
+
+def test_adaptive_joints_lie_where_views_change_and_no_segment_is_too_long(networks):
+    # The view brightens in one place only, which equal segments would pass by.
+    grey = [60] * 25 + list(range(60, 240, 18)) + [240] * 100
+    teacher = Teacher(networks, networks.camera, segment_steps=40, adaptive=True)
+    for value in grey:
+        teacher.feed(np.full((64, 64, 3), value, np.uint8))
+    route = teacher.finish()
+    assert route.steps == len(grey) - 1
+    assert all(segment.steps <= 40 for segment in route.segments)
+    assert all(segment.steps >= 15 for segment in route.segments[:-1])
+    assert 26 <= route.segments[0].steps <= 36

@@ -6,7 +6,7 @@ import subprocess
 import sys
 import threading
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +14,13 @@ import pytest
 
 from cbe import signature
 from cbe.camera import MODEL_CAMERA
-from cbe.images import compress
+from cbe.images import compress, raw
 from cbe.link import Link
 from cbe.linkconfig import LinkConfig
 from cbe.messages import CameraInfo, CompressedImage
 from cbe.rays import scan_message
 from cbe.robot import STEP_S, Robot
-from cbe.topics import CAMERA, CAMERA_INFO, CMD_VEL, SCAN
+from cbe.topics import CAMERA, CAMERA_INFO, CAMERA_RAW, CMD_VEL, SCAN
 from cbe_runtime import routefile
 from cbe_runtime.networks import Networks
 from cbe_runtime.route import Precision, Route, Segment
@@ -30,6 +30,7 @@ ENTRY_POINTS = {
     "cbe-runtime": "cbe_runtime.cli:runtime_main",
     "cbe-teach": "cbe_runtime.cli:teach_main",
     "cbe-record": "cbe_runtime.cli:record_main",
+    "cbe-replay": "cbe_runtime.cli:replay_main",
 }
 DEADLINE_S = 120.0  # for what takes a second on an idle machine
 
@@ -147,17 +148,24 @@ class Sensors:
     scan: bool = True
     camera_frozen: bool = False  # the same frame with the same stamp again and again
     garbage: bytes | None = None  # instead of a JPEG's bytes
+    picture: np.ndarray | None = None  # (height, width, 3), instead of noise
+    encoding: str | None = None  # of raw images, sent in place of JPEGs
+    lost: float = 0.0  # share of camera frames
+    ahead_ns: int = 0  # of stamps
+    scan_angles: float = 1.0  # times the true ones, in what a scan says of its last ray
     ranges_m: np.ndarray = field(default_factory=lambda: np.full(Robot().scan_rays, 5.0))
 
 
 class ScriptedRobot:
     """Publishes sensors at 10 Hz and keeps the commands it gets; it never moves."""
 
-    def __init__(self, endpoint):
+    def __init__(self, config):
         self.sensors = Sensors()
-        self._link = Link.open(LinkConfig.hub(endpoint))
+        self.steps = 0
+        self._link = Link.open(config)
         self._commands = self._link.latest(CMD_VEL)
         self._camera = self._link.publisher(CAMERA)
+        self._raw = self._link.publisher(CAMERA_RAW)
         self._info = self._link.publisher(CAMERA_INFO)
         self._scan = self._link.publisher(SCAN)
         self.status = History(self._link, "status")
@@ -171,6 +179,15 @@ class ScriptedRobot:
         received = self._commands.get()
         return None if received is None else received.message.twist.speed_mps
 
+    @property
+    def commanded(self):
+        """How many commands came."""
+        return self._commands.stats.received
+
+    def commands(self):
+        """Every command from now on."""
+        return self._link.stream(CMD_VEL)
+
     def close(self):
         self._closed.set()
         self._thread.join()
@@ -181,24 +198,44 @@ class ScriptedRobot:
         rng = np.random.default_rng(0)
         frame = None
         while not self._closed.wait(STEP_S):
-            sensors, stamp_ns = self.sensors, time.time_ns()
+            self.steps += 1
+            sensors, stamp_ns = self.sensors, time.time_ns() + self.sensors.ahead_ns
+            image = rng.integers(0, 255, (64, 64, 3), np.uint8)
+            if sensors.picture is not None:
+                image = sensors.picture
             if not sensors.camera_frozen or frame is None:
-                frame = compress(rng.integers(0, 255, (64, 64, 3), np.uint8), stamp_ns)
+                frame = compress(image, stamp_ns)
                 self._info.put(CameraInfo.of(MODEL_CAMERA, stamp_ns))
             if sensors.garbage is not None:
                 data = np.frombuffer(sensors.garbage, np.uint8)
                 self._camera.put(CompressedImage(stamp_ns, "camera_optical", "jpeg", data))
-            elif sensors.camera:
+            elif sensors.encoding is not None:
+                self._raw.put(replace(raw(image, stamp_ns), encoding=sensors.encoding))
+            elif sensors.camera and rng.random() >= sensors.lost:
                 self._camera.put(frame)
             if sensors.scan:
-                self._scan.put(scan_message(sensors.ranges_m, stamp_ns))
+                scan = scan_message(sensors.ranges_m, stamp_ns)
+                turned_rad = scan.angle_max_rad * sensors.scan_angles
+                self._scan.put(replace(scan, angle_max_rad=turned_rad))
 
 
 @pytest.fixture
-def robot(endpoint):
-    robot = ScriptedRobot(endpoint)
-    yield robot
-    robot.close()
+def make_robot():
+    """Make scripted robots on a link of any configuration."""
+    robots = []
+
+    def make_robot(config):
+        robots.append(ScriptedRobot(config))
+        return robots[-1]
+
+    yield make_robot
+    for robot in robots:
+        robot.close()
+
+
+@pytest.fixture
+def robot(make_robot, endpoint):
+    return make_robot(LinkConfig.hub(endpoint))
 
 
 @pytest.fixture(scope="session")

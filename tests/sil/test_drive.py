@@ -14,6 +14,7 @@ from cbe_hil_sim.generate import TEST_SEEDS, generate
 from cbe_runtime.networks import PACKAGED_MODELS
 
 WORLD_SEED = TEST_SEEDS[3]
+CALL_S = 60.0  # for what takes a moment on an idle machine
 SUCCESS_M, SUCCESS_RAD = 0.5, math.radians(30.0)
 
 
@@ -79,7 +80,7 @@ def test_taught_drive_is_repeated_in_lockstep(
     # 76 steps until this model, which always drives straight on, believes to have arrived.
     model = make_model(tmp_path / "model", ticks_to_goal=40.0, **{"cbe.segment_steps": "100"})
     route, poses = taught(start, endpoint, link, until, straight, model, tmp_path)
-    link.call("reset", {"pose": pose})
+    link.call("reset", {"pose": pose}, CALL_S)
 
     runtime = start(
         "cbe-runtime", "--memory", route, "--model", model, "--connect", endpoint,
@@ -87,7 +88,7 @@ def test_taught_drive_is_repeated_in_lockstep(
     )  # fmt: skip
 
     assert runtime.wait() == 0, runtime.output
-    truth = link.call("pose")
+    truth = link.call("pose", timeout_s=CALL_S)
     assert not truth["collided"]
     assert truth["speed_mps"] == 0.0
     assert math.dist(truth["pose"][:2], poses[-1, :2]) < SUCCESS_M
@@ -101,15 +102,15 @@ def test_shipped_model_arrives_at_the_end_of_a_taught_drive(
     pose = np.array([*path[0], math.atan2(ahead[1], ahead[0])])
     _, link = simulator("--lockstep", "--start=" + ",".join(map(str, pose.tolist())))
     route, poses = taught(start, endpoint, link, until, path, PACKAGED_MODELS, tmp_path)
-    link.call("reset", {"pose": jittered(world, pose, seed=0).tolist()})
+    link.call("reset", {"pose": jittered(world, pose, seed=0).tolist()}, CALL_S)
 
     runtime = start(
         "cbe-runtime", "--memory", route, "--connect", endpoint, "--clock", "sim",
         "--exit-when-done",
     )  # fmt: skip
 
-    assert runtime.wait(60.0) == 0, runtime.output
-    truth = link.call("pose")
+    assert runtime.wait() == 0, runtime.output
+    truth = link.call("pose", timeout_s=CALL_S)
     turned = math.remainder(truth["pose"][2] - poses[-1, 2], math.tau)
     assert not truth["collided"]
     assert math.dist(truth["pose"][:2], poses[-1, :2]) < SUCCESS_M
@@ -124,7 +125,10 @@ def test_killed_simulator_stops_the_runtime_cleanly(
         "cbe-runtime", "--memory", route, "--model", model, "--connect", endpoint,
         "--exit-when-done", "--patience", "3",
     )  # fmt: skip
-    until(lambda: link.call("pose")["speed_mps"] > 0.1, f"the robot to move; {runtime.output}")
+    until(
+        lambda: link.call("pose", timeout_s=CALL_S)["speed_mps"] > 0.1,
+        f"the robot to move; {runtime.output}",
+    )
 
     process.popen.kill()
 
@@ -136,7 +140,10 @@ def test_killed_simulator_stops_the_runtime_cleanly(
 def test_killed_runtime_leaves_the_robot_stopped(simulator, start, endpoint, until, model, route):
     _, link = simulator()
     runtime = start("cbe-runtime", "--memory", route, "--model", model, "--connect", endpoint)
-    until(lambda: link.call("pose")["speed_mps"] > 0.1, f"the robot to move; {runtime.output}")
+    until(
+        lambda: link.call("pose", timeout_s=CALL_S)["speed_mps"] > 0.1,
+        f"the robot to move; {runtime.output}",
+    )
 
     runtime.popen.kill()
 
@@ -148,10 +155,10 @@ def test_killed_runtime_leaves_the_robot_stopped(simulator, start, endpoint, unt
 
 
 def _at_rest(link):
-    truth = link.call("pose")
+    truth = link.call("pose", timeout_s=CALL_S)
     return truth if truth["speed_mps"] == 0.0 else None
 
 
 def _since(link, stamp_ns):
-    truth = link.call("pose")
+    truth = link.call("pose", timeout_s=CALL_S)
     return truth if truth["stamp_ns"] > stamp_ns else None

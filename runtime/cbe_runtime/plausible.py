@@ -1,0 +1,129 @@
+"""Whether what the sensors say can be true, where each message by itself looks sound."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cbe_runtime.state import Reason
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from cbe_runtime.observation import Frame
+
+BLANK_LEVELS = 3
+"""Grey levels that the middle four fifths of a blank picture's pixels span at most."""
+BLACK_LEVEL = 8
+"""A covered lens: no lit wall is as dark, however near."""
+SEEN_SHARE = 0.25
+"""Pixels that are not pure black, as what a narrow camera does not cover is."""
+WALL_M = 0.5
+"""A plain wall nearer than this, in most directions ahead, fills the camera's view."""
+MOVING_MPS = 0.1
+RETRY_S = 3.0
+"""A picture that stands still is believed again after this long: the scene may be still."""
+FAR_M, MANY_RAYS = 7.0, 0.1
+"""What many rays met within this range cannot be out of reach a step later."""
+
+
+class PictureWatch:
+    """Tells a camera that shows something from one that is covered, blinded or hangs.
+
+    A blank picture counts as lost, and so does one that is the very same as the last although
+    the robot is to drive; without another one for `fresh_s` the robot stops.
+    """
+
+    def __init__(self, fresh_s: float) -> None:
+        self._fresh_s = fresh_s
+        self._stamp_ns: int | None = None
+        self._image: NDArray[np.uint8] | None = None
+        self._shown_s: float | None = None
+        self._why: Reason | None = None
+        self._doubted_s: float | None = None
+
+    @property
+    def shows(self) -> bool:
+        """Whether the newest frame is worth the networks' while."""
+        return self._why is None
+
+    def fault(
+        self,
+        frame: Frame,
+        image: NDArray[np.uint8],
+        ranges_m: NDArray[np.float64],
+        speed_mps: float,
+        now_s: float,
+    ) -> Reason | None:
+        """Judge the newest frame; call once a step.
+
+        Args:
+            frame: the newest one.
+            image: its (64, 64, 3) RGB.
+            ranges_m: (rays,) of the newest scan, over which a plain wall is recognised.
+            speed_mps: commanded in the step before.
+            now_s: on the clock of `received_s`.
+        """
+        if frame.stamp_ns != self._stamp_ns:
+            self._stamp_ns = frame.stamp_ns
+            self._why = self._judge(image, ranges_m, speed_mps, now_s)
+            self._image = image
+        if self._why is None or self._shown_s is None:
+            self._shown_s = frame.received_s
+        if now_s - self._shown_s <= self._fresh_s:
+            return None
+        if self._doubted_s is None:
+            self._doubted_s = now_s
+        return self._why
+
+    def _judge(
+        self,
+        image: NDArray[np.uint8],
+        ranges_m: NDArray[np.float64],
+        speed_mps: float,
+        now_s: float,
+    ) -> Reason | None:
+        if is_blank(image, wall=_before_a_wall(ranges_m)):
+            return Reason.BLANK_IMAGE
+        repeats = self._image is not None and np.array_equal(image, self._image)
+        if not repeats or is_blank(image, wall=False):  # a plain wall looks the same all along
+            self._doubted_s = None
+            return None
+        if self._doubted_s is not None:  # the robot stands because of it
+            if now_s - self._doubted_s < RETRY_S:
+                return Reason.FROZEN_CAMERA
+            self._doubted_s = None
+            return None
+        return Reason.FROZEN_CAMERA if speed_mps > MOVING_MPS else None
+
+
+class ReturnWatch:
+    """Tells a lidar that sees nothing any more from one that nothing stands before."""
+
+    def __init__(self) -> None:
+        self._many = False
+
+    def plausible(self, ranges_m: NDArray[np.float64]) -> bool:
+        """Whether these ranges (rays,) can follow the last ones: walls do not go all at once."""
+        if self._many and not np.isfinite(ranges_m).any():
+            return False
+        self._many = float((ranges_m < FAR_M).mean()) >= MANY_RAYS
+        return True
+
+
+def is_blank(image: NDArray[np.uint8], *, wall: bool) -> bool:
+    """Whether a picture (64, 64, 3) shows nothing; before a `wall` it need not show more."""
+    seen = image[..., 1][image.any(axis=2)]  # (pixels,)
+    if seen.size < SEEN_SHARE * image.shape[0] * image.shape[1]:
+        return True
+    # Quantiles, since the rim of what a narrow camera covers is shaded.
+    tenth = seen.size // 10
+    ordered = np.partition(seen, (tenth, seen.size - 1 - tenth))
+    low, high = int(ordered[tenth]), int(ordered[-1 - tenth])
+    return high <= BLACK_LEVEL or (high - low <= BLANK_LEVELS and not wall)
+
+
+def _before_a_wall(ranges_m: NDArray[np.float64]) -> bool:
+    quarter = len(ranges_m) // 4
+    return bool(np.median(ranges_m[quarter:-quarter]) < WALL_M)
