@@ -21,8 +21,10 @@ demo: $(VENV)/.demo ## teach once and repeat in simulation (SEED=n SCENE=dir OBS
 test: $(VENV)/.all ## run the tests (ARGS="-k name" narrows)
 	$(BIN)/python -m pytest -n 2 --dist loadgroup $(ARGS)
 
-soak: $(VENV)/.all ## feed hostile files and messages, 200000 of each kind (INPUTS=n SEED=n)
+soak: $(VENV)/.all ## drive 15 min, feed 200000 hostile inputs of a kind, kill 200 teachers (MINUTES=n INPUTS=n SEED=n)
+	$(BIN)/cbe-bench soak --minutes $(or $(MINUTES),15)
 	CBE_FUZZ_INPUTS=$(or $(INPUTS),200000) CBE_FUZZ_SEED=$(or $(SEED),0) $(BIN)/python -m pytest tests/fuzz -n 2 --timeout 14400 $(ARGS)
+	CBE_KILLS=200 CBE_KILL_SEED=$(or $(SEED),0) $(BIN)/python -m pytest tests/runtime/test_teach_crashes.py
 
 check: $(VENV)/.all ## lint, format check, types and the rooms' import rules
 	$(BIN)/ruff check
