@@ -23,6 +23,7 @@ from cbe_runtime.networks import Networks, Prediction
 from cbe_runtime.state import State
 
 STEPS = 48
+LENGTH_M = 0.05 * STEPS
 ZERO_S, STAND_S = 0.4, 0.8
 GRAIN = np.random.default_rng(0).integers(60, 200, (64, 64, 3), np.uint8)
 
@@ -58,15 +59,15 @@ class Hall:
 
 
 class StraightOn:
-    """Stands for `Networks`: the waypoint is ahead, and the behavior done after some ticks."""
+    """Stands for `Networks`: the waypoint is ahead, and progress a function of the ticks."""
 
     model_id = "0011223344556677"
     network_period = 2
     segment_steps = 100
     camera = MODEL_CAMERA
 
-    def __init__(self, ticks=STEPS // 2):
-        self._ticks = ticks
+    def __init__(self, progress):
+        self._progress = progress
 
     def encoder_state(self):
         return None
@@ -81,7 +82,7 @@ class StraightOn:
         return np.full(400, 0.5, np.float32)
 
     def generate(self, *, state, **memory):
-        return Prediction(np.array([0.5, 0.0]), state / self._ticks, 1.0), state + 1
+        return Prediction(np.array([0.5, 0.0]), self._progress(state), 1.0), state + 1
 
 
 class Blind:
@@ -104,13 +105,13 @@ def named(name):
 
 
 def drive(fault, seed=0, driver=None, backend=None):
-    networks = StraightOn()
+    backend = backend or Hall()
+    networks = StraightOn(lambda _: float(backend.poses[0, 0]) / LENGTH_M)
     if driver is None:
         driver = Follower(networks, single.teach(networks, [GRAIN] * (STEPS + 1)))
     demonstration = np.zeros((STEPS + 1, 3))
     demonstration[:, 0] = 0.05 * np.arange(STEPS + 1)
     rng = np.random.default_rng(seed)
-    backend = backend or Hall()
     return ride(driver, backend, lambda image: image, demonstration, np.zeros(3), fault, rng)
 
 
@@ -217,7 +218,9 @@ def test_share_of_lost_messages_is_that_of_the_lane(link):
 def straight_on(monkeypatch):
     monkeypatch.setattr(scenario, "GROUP", 2)
     monkeypatch.setattr(evaluation, "GROUP", 2)
-    monkeypatch.setattr(Networks, "load", classmethod(lambda cls, folder: StraightOn(10)))
+    monkeypatch.setattr(
+        Networks, "load", classmethod(lambda cls, folder: StraightOn(lambda n: n / 10))
+    )
     yield
     evaluation._networks.cache_clear()
 
