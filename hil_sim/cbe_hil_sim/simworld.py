@@ -9,14 +9,13 @@ from numpy.typing import NDArray
 from cbe.camera import CameraModel
 from cbe.errors import ConfigError
 from cbe_hil_sim.backend import Backend
-from cbe_hil_sim.world import World
+from cbe_hil_sim.world import BIN_SIZE_M, World
 
 if TYPE_CHECKING:
     from cbe_hil_sim.bullet import BulletBackend
 
 PLAN_SUFFIXES = (".yaml", ".yml")
 BACKENDS = ("bullet", "column")
-BIN_SIZE_M = (0.3, 0.3, 1.0)  # the paper's trash can
 BIN_RGB = (70, 80, 90)
 
 

@@ -16,6 +16,7 @@ FLOOR_TOLERANCE_M = 0.03  # lower edges are driven over
 SHADE_POSITIVE_X, SHADE_NEGATIVE_X = 0.95, 0.82
 SHADE_POSITIVE_Y, SHADE_NEGATIVE_Y = 1.0, 0.88
 SHADE_UP, SHADE_DOWN = 1.0, 0.7
+BIN_SIZE_M = (0.3, 0.3, 1.0)  # the paper's trash can
 
 
 @dataclass(frozen=True, slots=True)

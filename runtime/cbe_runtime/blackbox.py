@@ -9,18 +9,17 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 from cbe.errors import RecordingError
 from cbe.messages import MESSAGE_TYPES, CameraInfo
 from cbe_runtime import mcapfile
 from cbe_runtime.jsonschemas import JSON_TYPES
-from cbe_runtime.mcapfile import Recorded, Recorder
+from cbe_runtime.mcapfile import Closing, Recorded, Recorder
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
-    from types import TracebackType
 
 logger = logging.getLogger(__name__)
 
@@ -45,7 +44,7 @@ class RingConfig:
     max_bytes: int = 512 * 2**20
 
 
-class Ring:
+class Ring(Closing):
     """Writes to numbered files of `SEGMENT_S`, each whole by itself, and removes the oldest.
 
     Files of earlier runs are part of the ring. A full disk costs the oldest file first.
@@ -123,23 +122,6 @@ class Ring:
             self._recorder.close()
         finally:
             self._lock.close()
-
-    def __enter__(self) -> Self:
-        """The ring itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close; a file that cannot be finished does not hide the first error."""
-        try:
-            self.close()
-        except OSError:
-            if error is None:
-                raise
 
     def _next(self, make_room: bool = False) -> Recorder:
         """Finish the file and begin another; to `make_room`, remove the oldest in any case."""

@@ -178,9 +178,7 @@ class Search:
         if not self._untried:
             kept = [each for each in self._best if each.place.confidence > config.suspected]
             self.failed = not kept
-            self._best = kept or self._best
-            # Together they begin anew, with the next frame as the first.
-            if kept:
+            if kept:  # together they begin anew, with the next frame as the first
                 self._best = [self._begin(each.behavior.segment) for each in kept]
 
     def _follow(self, sight: Sight) -> None:

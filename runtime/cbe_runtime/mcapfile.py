@@ -120,7 +120,32 @@ def _described(content: memoryview) -> ReadDataStream:
     return ReadDataStream(BytesIO(content))
 
 
-class Recorder:
+class Closing:
+    """A writer that a `with` block closes."""
+
+    def close(self) -> None:
+        """Finish what is written."""
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        """The writer itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close; an end that does not fit on a full disk does not hide the first error."""
+        try:
+            self.close()
+        except OSError:
+            if error is None:
+                raise
+
+
+class Recorder(Closing):
     """Writes a recording: profile ros2, schemas in ros2msg or jsonschema, zstd chunks."""
 
     def __init__(self, path: Path, chunk_bytes: int = CHUNK_BYTES, new: bool = False) -> None:
@@ -181,23 +206,6 @@ class Recorder:
             self._writer.finish()  # type: ignore[no-untyped-call]
         finally:
             self._file.close()
-
-    def __enter__(self) -> Self:
-        """The recorder itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close; an index that does not fit on a full disk does not hide the first error."""
-        try:
-            self.close()
-        except OSError:
-            if error is None:
-                raise
 
     def _broken(self, error: OSError) -> RecordingError:
         return RecordingError(f"cannot go on writing {self._path}: {error.strerror}; free space")

@@ -12,12 +12,12 @@ from cbe.robot import Robot
 from cbe_hil_sim.clearance import Clearance
 from cbe_hil_sim.demonstrator import demonstrate, sample_routes
 from cbe_hil_sim.generate import VALIDATION_SEEDS, generate
-from cbe_hil_sim.world import World
+from cbe_hil_sim.world import BIN_SIZE_M, World
 from cbe_hil_sim.worldbatch import WorldBatch
 
 SHORTEST_M, LONGEST_M = 8.0, 25.0
 BINS = 8  # at most, in a world's twin
-BIN_RADIUS_M, BIN_HEIGHT_M = 0.15, 1.0
+BIN_RADIUS_M, BIN_HEIGHT_M = 0.5 * BIN_SIZE_M[0], BIN_SIZE_M[2]
 BIN_ASIDE_M = 0.3  # of a drive, at most
 BIN_PASS_M = 0.6  # left free on one side at least
 BINS_APART_M = 2.0
