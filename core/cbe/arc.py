@@ -4,6 +4,8 @@ The body is a disc round the rear axle, so along an arc it sweeps a strip of con
 and whatever lies behind the axle only recedes.
 """
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,19 +22,26 @@ def scan_points(scan_m: NDArray[np.floating], robot: Robot, pool: int = 1) -> ND
     positive range become points `FAR_M` away.
     """
     batch, rays = scan_m.shape
-    angle = robot.scan_angle_min_rad + robot.scan_angle_increment_rad * np.arange(rays)
     valid = np.isfinite(scan_m) & (scan_m > 0.0)
     ranges = np.where(valid, scan_m, FAR_M).astype(np.float32)
+    cos, sin = _directions(robot, rays)
     if pool > 1:
         groups = rays // pool
-        grouped = ranges[:, : groups * pool].reshape(batch, groups, pool)  # (B, groups, pool)
-        nearest = grouped.argmin(axis=-1)
-        ranges = grouped.min(axis=-1)
-        angle = angle[np.arange(groups) * pool + nearest]
+        grouped = ranges[:, : groups * pool].reshape(batch, groups, pool)
+        nearest = grouped.argmin(axis=-1) + np.arange(0, groups * pool, pool)  # (B, groups)
+        ranges = ranges[np.arange(batch)[:, None], nearest]
+        cos, sin = cos.take(nearest), sin.take(nearest)
     points = np.empty((*ranges.shape, 2), np.float32)
-    points[..., 0] = robot.scan_x_m + ranges * np.cos(angle)
-    points[..., 1] = ranges * np.sin(angle)
+    points[..., 0] = robot.scan_x_m + ranges * cos
+    points[..., 1] = ranges * sin
     return points
+
+
+@lru_cache
+def _directions(robot: Robot, rays: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Cosine and sine (rays,) of each ray's angle."""
+    angle = robot.scan_angle_min_rad + robot.scan_angle_increment_rad * np.arange(rays)
+    return np.cos(angle).astype(np.float32), np.sin(angle).astype(np.float32)
 
 
 def along_and_across(

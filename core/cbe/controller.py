@@ -88,12 +88,15 @@ class RmpController:
         repelled = [0.0, 45.0, -45.0, 22.5, -22.5, 67.5, -67.5, 90.0, -90.0]
         angle = np.radians([0.0, 45.0, -45.0, *repelled])
         self._points = radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)  # (12, 2)
-        self._attracted_spread_m2 = float((self._points[:_ATTRACTED] ** 2).sum())
         self._twice_repelled = (2.0 * self._points[_ATTRACTED:]).astype(np.float32)
         weight = np.ones(len(repelled))
         weight[0] = gains.nose_weight
         weight[1:3] = gains.corner_weight
-        self._repulsion_weight = weight * gains.repulsion_metric
+        reach = np.exp(gains.repulsion_decay_per_m * gains.repulsion_reach_m)
+        spread_m2 = (self._points[:_ATTRACTED] ** 2).sum()
+        attracted = (float(_ATTRACTED), float(spread_m2))
+        # Of attraction, and of repulsion at no distance.
+        self._metric = np.append(attracted, weight * gains.repulsion_metric * reach)  # (11,)
         self._manoeuvres = Manoeuvres(robot, gains.manoeuvres)
 
     def step(
@@ -140,8 +143,9 @@ class RmpController:
         present = np.tan(motion.steer_rad) / robot.wheelbase_m
         ahead = points[:, _REAR_POINTS:-_REAR_POINTS]
         choice = self._manoeuvres.choose(toward, present, waypoint, ahead)
-        speed = np.where(distance < gains.arrived_m, 0.0, gains.waypoint_speed_per_s * distance)
-        speed = np.where((waypoint[:, 0] <= 0.0) & (distance < gains.slipped_m), 0.0, speed)
+        slipped = (waypoint[:, 0] <= 0.0) & (distance < gains.slipped_m)
+        reached = slipped | (distance < gains.arrived_m)
+        speed = gains.waypoint_speed_per_s * distance * ~reached
         speed = np.minimum(speed, np.sqrt(2.0 * gains.braking_mps2 * choice.free_m))
         openness = np.minimum(np.maximum(choice.clearance_m / gains.open_clearance_m, 0.0), 1.0)
         tight = gains.tight_speed_mps
@@ -161,18 +165,12 @@ class RmpController:
         present = np.tan(steer) / wheelbase
         turning = np.maximum(speed, _LEAST_STEERING_SPEED_MPS)
         gain = turning / (wheelbase * np.cos(steer) ** 2)
-
         # A point at (x, y) moves with speed * (1 - c y, c x); its Jacobian's columns are
-        # (1 - c y, c x) for speed and gain * (-y, x) for steering. Summed over the attracted
-        # points, which lie symmetric to the axis:
-        spread = self._attracted_spread_m2
-        m11 = _ATTRACTED + present**2 * spread
-        m12 = gain * present * spread
-        m22 = gain**2 * spread
-        # The velocities they would have on the wanted arc are within the Jacobian's span.
-        pull1 = gains.attraction_per_s * (wanted_speed - speed)
-        pull2 = gains.attraction_per_s * (curvature - present) * turning / gain
-        r1, r2 = m11 * pull1 + m12 * pull2, m12 * pull1 + m22 * pull2
+        # (1 - c y, c x) for speed and gain * (-y, x) for steering. A row for each policy: what
+        # these are along its direction, and the acceleration it wishes there.
+        rows = np.empty((len(points), 3, len(self._metric)))
+        metric = np.empty((len(points), len(self._metric)))
+        metric[:] = self._metric
 
         repelled = self._points[_ATTRACTED:]  # (9, 2)
         # Squared distance but for the repelled points' own length, which changes no minimum.
@@ -183,21 +181,24 @@ class RmpController:
         away = away / gap_m[..., None]
         x, y = repelled[:, 0], repelled[:, 1]
         across = away[..., 1] * x - away[..., 0] * y  # (B, 9)
-        rows = np.empty((3, *gap_m.shape))  # Jacobian row and wished acceleration along `away`
-        by_speed, by_steer, push = rows
-        by_speed[:] = away[..., 0] + present[:, None] * across
-        by_steer[:] = gain[:, None] * across
+        by_speed, by_steer = away[..., 0] + present[:, None] * across, gain[:, None] * across
         approach = np.minimum(speed[:, None] * by_speed, 0.0)
-        push[:] = gains.repulsion_mps2 - gains.repulsion_damping_per_s * approach
-        metric = self._repulsion_weight * np.exp(
-            -gains.repulsion_decay_per_m * (gap_m - gains.repulsion_reach_m)
-        )
-        rows = rows.swapaxes(0, 1)  # (B, 3, 9)
-        sums = (rows * metric[:, None]) @ rows.swapaxes(1, 2)  # (B, 3, 3)
-        m11, m12, m22 = m11 + sums[:, 0, 0], m12 + sums[:, 0, 1], m22 + sums[:, 1, 1]
-        r1, r2 = r1 + sums[:, 0, 2], r2 + sums[:, 1, 2]
+        rows[:, 0, 2:], rows[:, 1, 2:] = by_speed, by_steer
+        rows[:, 2, 2:] = gains.repulsion_mps2 - gains.repulsion_damping_per_s * approach
+        metric[:, 2:] *= np.exp(-gains.repulsion_decay_per_m * gap_m)
+
+        # The attracted points lie symmetric to the axis: summed, they are one at base_link and
+        # one abreast, which wish for the velocities they would have on the wanted arc.
+        faster = gains.attraction_per_s * (wanted_speed - speed)
+        sharper = gains.attraction_per_s * (curvature - present) * turning
+        rows[:, 0, 0], rows[:, 1, 0], rows[:, 2, 0] = 1.0, 0.0, faster
+        rows[:, 0, 1], rows[:, 1, 1], rows[:, 2, 1] = present, gain, present * faster + sharper
+
         # Pseudo-inverse of the 2 x 2 normal equations; the attracted points keep it regular.
-        determinant = m11 * m22 - m12**2
+        sums = (rows * metric[:, None]) @ rows.swapaxes(1, 2)  # (B, 3, 3)
+        m11, m12, m22 = sums[:, 0, 0], sums[:, 0, 1], sums[:, 1, 1]
+        r1, r2 = sums[:, 0, 2], sums[:, 1, 2]
+        determinant = m11 * m22 - m12 * m12
         return (m22 * r1 - m12 * r2) / determinant, (m11 * r2 - m12 * r1) / determinant
 
 
@@ -215,5 +216,5 @@ def _curvature_to(
     x, y = waypoint[:, 0], waypoint[:, 1]
     curvature = 2.0 * y / np.maximum(distance, 0.05) ** 2
     # What lies behind needs a full turn to its side.
-    curvature = np.where(x < 0.0, np.where(y >= 0.0, widest, -widest), curvature)
+    curvature = np.where(x < 0.0, np.copysign(widest, y), curvature)
     return _within(curvature, -widest, widest)

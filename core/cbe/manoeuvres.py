@@ -60,14 +60,17 @@ class Manoeuvres:
         turned = (first * SPACING_M * FIRST_SAMPLES)[:, None, None]
         x = lead_x[:, -1, None, None] + np.cos(turned) * tail_x - np.sin(turned) * tail_y
         y = lead_y[:, -1, None, None] + np.sin(turned) * tail_x + np.cos(turned) * tail_y
-        # (2, F * 3 + F * G * 7): the leads, each shared by G manoeuvres, then the tails.
-        self._tree = np.stack([np.append(lead_x, x), np.append(lead_y, y)]).astype(np.float32)
+        # (4, F * 3 + F * G * 7): the leads, each shared by G manoeuvres, then the tails.
+        x, y = np.append(lead_x, x), np.append(lead_y, y)
+        self._tree = np.stack([x, y, np.ones_like(x), x * x + y * y]).astype(np.float32)
         manoeuvre = np.arange(len(self._first))
         begin = manoeuvre[:, None] // gains.second_arcs * FIRST_SAMPLES + np.arange(FIRST_SAMPLES)
         end = lead_x.size + manoeuvre[:, None] * SECOND_SAMPLES + np.arange(SECOND_SAMPLES)
         direct = self._tree.shape[1] + np.arange(SAMPLES)  # the arc to the waypoint comes last
         rows = np.concatenate([np.concatenate([begin, end], axis=1), direct[None]])
         self._samples = np.ascontiguousarray(rows.T)  # (10, T + 1) places of each manoeuvre
+        self._toward_weight_m = gains.toward_weight / widest
+        self._change_weight_m = gains.change_weight / widest
         self._travelled = (SPACING_M * np.arange(1, SAMPLES + 1)).astype(np.float32)
 
     def choose(
@@ -84,39 +87,40 @@ class Manoeuvres:
         """
         gains = self._gains
         batch, tree = len(toward_per_m), self._tree.shape[1]
-        places = np.empty((batch, 2, tree + SAMPLES), np.float32)
+        places = np.empty((batch, 4, tree + SAMPLES), np.float32)
         places[:, :, :tree] = self._tree
-        places[:, 0, tree:], places[:, 1, tree:] = _arc(toward_per_m, SAMPLES)
-        sample = _nearest_m(places, points_m).take(self._samples, axis=1)  # (B, 10, T + 1)
-        sample -= np.float32(self._robot.body_radius_m)
-        off = places - waypoint_m.astype(np.float32)[..., None]
-        off *= off
-        miss = np.sqrt(
-            (off[:, 0] + off[:, 1]).take(self._samples, axis=1).min(axis=1)
-        )  # (B, T + 1)
+        x, y = _arc(toward_per_m, SAMPLES)
+        places[:, 0, tree:], places[:, 1, tree:], places[:, 2, tree:] = x, y, 1.0
+        places[:, 3, tree:] = x * x + y * y
+        square = _square_m2(places, points_m, waypoint_m)
+        nearest = np.maximum(square[:, :-1].min(axis=1), 0.0)
+        sample = np.sqrt(nearest).take(self._samples, axis=1)
+        sample -= np.float32(self._robot.body_radius_m)  # (B, 10, T + 1)
+        miss = square[:, -1].take(self._samples, axis=1).min(axis=1)  # (B, T + 1)
+        miss = np.sqrt(np.maximum(miss, 0.0))
 
         distance = np.hypot(waypoint_m[:, 0], waypoint_m[:, 1]).astype(np.float32)
         # A waypoint nearer than usual is the goal: nothing behind it matters.
         beyond = gains.beyond_per_m * np.maximum(distance - gains.near_waypoint_m, 0.0)
         horizon = np.minimum(distance + beyond, self._travelled[-1])[:, None]
-        minded = self._travelled <= horizon + np.float32(0.5 * SPACING_M)  # (B, 10)
-        sample += np.where(minded, np.float32(0.0), np.float32(_OPEN_M))[..., None]
+        unminded = self._travelled > horizon + np.float32(0.5 * SPACING_M)  # (B, 10)
+        sample += (unminded * np.float32(_OPEN_M))[..., None]
         clearance = sample.min(axis=1)  # (B, T + 1)
-        first_hit = (sample < gains.least_clearance_m).argmax(axis=1)
         hit = clearance < gains.least_clearance_m
-        free = np.where(hit, SPACING_M * first_hit, _OPEN_M)
+        free = SPACING_M * (sample < gains.least_clearance_m).argmax(axis=1)  # where it hits
 
         first = np.empty((batch, len(self._first) + 1))  # (B, T + 1)
         first[:, :-1], first[:, -1] = self._first, toward_per_m
         short = 1.0 - clearance / gains.wanted_clearance_m
         short = np.minimum(np.maximum(short, 0.0), 1.5)
-        blocked = np.maximum(1.0 - free / np.maximum(horizon, SPACING_M), 0.0)
-        change = gains.toward_weight * np.abs(first - toward_per_m[:, None])
-        change += gains.change_weight * np.abs(first - present_per_m[:, None])
-        cost = change / self._robot.max_curvature_per_m + gains.miss_weight_per_m * miss
+        blocked = hit * np.maximum(1.0 - free / np.maximum(horizon, SPACING_M), 0.0)
+        cost = self._toward_weight_m * np.abs(first - toward_per_m[:, None])
+        cost += self._change_weight_m * np.abs(first - present_per_m[:, None])
+        cost += gains.miss_weight_per_m * miss
         cost += gains.clearance_weight * short * short + gains.blocked_weight * blocked
-        best = np.arange(batch), cost.argmin(axis=1)
-        return Choice(first[best], clearance[best], free[best])
+        best = cost.argmin(axis=1) + np.arange(batch) * cost.shape[1]
+        free_m = np.where(hit.take(best), free.take(best), _OPEN_M)
+        return Choice(first.take(best), clearance.take(best), free_m)
 
 
 def _arc(
@@ -128,11 +132,19 @@ def _arc(
     return np.sin(angle) / curvature, (1.0 - np.cos(angle)) / curvature
 
 
-def _nearest_m(places: NDArray[np.float32], points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Distance (B, N) from places (B, 2, N) to the nearest of points (B, P, 2)."""
-    # |q - p|^2 = |q|^2 + (|p|^2 - 2 p q): one product and one minimum over few, long rows.
-    x, y = points[..., 0], points[..., 1]
-    mixed = points @ (np.float32(-2.0) * places)  # (B, P, N)
-    mixed += (x * x + y * y)[..., None]
-    x, y = places[:, 0], places[:, 1]
-    return np.asarray(np.sqrt(np.maximum(mixed.min(axis=1) + (x * x + y * y), 0.0)))
+def _square_m2(
+    places: NDArray[np.float32], points: NDArray[np.float32], waypoint: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Squared distances (B, P + 1, N) of points (B, P, 2), then waypoints (B, 2), from places.
+
+    `places` (B, 4, N) are x, y, 1, x^2 + y^2.
+    """
+    # |q - p|^2 = |q|^2 + |p|^2 - 2 p q: one product, and hardly a pass over its N columns besides.
+    batch, count = points.shape[:2]
+    ends = np.empty((batch, count + 1, 4), np.float32)
+    ends[:, :count, :2], ends[:, count, :2] = points, waypoint
+    x, y = ends[..., 0], ends[..., 1]
+    ends[..., 2] = x * x + y * y
+    ends[..., :2] *= np.float32(-2.0)
+    ends[..., 3] = 1.0
+    return np.asarray(ends @ places)

@@ -34,7 +34,7 @@ class LossWeights:
 
     waypoint: float = 2.0
     progress: float = 2.0
-    on_route: float = 0.1
+    on_route: float = 0.2
     motion: float = 1.0  # relative pose of consecutive frames
     displacement: float = 0.2  # pose since the start, in every z
     relation: float = 0.3  # relative pose of two views, from their attractors
@@ -63,10 +63,10 @@ class TrainConfig:
     view_updates: int = 48  # in one such iteration
     cloning_sequences: int = 21_000  # expert at the wheel, short behaviors
     annealing_sequences: int = 13_000  # the expert's share falls from 1 to 0
-    expert_episodes: float = 0.2  # always driven by the (noisy) expert
-    wrong_episodes: float = 0.06  # shown another behavior's memory
+    expert_episodes: float = 0.1  # always driven by the (noisy) expert
+    wrong_episodes: float = 0.08  # shown another behavior's memory
     joining_episodes: float = 0.15  # start in the middle of the behavior
-    kidnapped_episodes: float = 0.08  # are put elsewhere on the way
+    kidnapped_episodes: float = 0.12  # are put elsewhere on the way
     bin_episodes: float = 0.2  # meet bins that the demonstration did not
     without_attractors: float = 0.04  # behaviors learnt from z alone, as the ablation drives them
     without_embedding: float = 0.04  # and from attractors alone
