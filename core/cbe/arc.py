@@ -18,12 +18,11 @@ FAR_M = 100.0
 def scan_points(scan_m: NDArray[np.floating], robot: Robot, pool: int = 1) -> NDArray[np.float32]:
     """Returns of scans (B, rays) as base_link points (B, rays // pool, 2).
 
-    Of each `pool` neighbouring rays only the nearest return is kept. Rays without a finite,
-    positive range become points `FAR_M` away.
+    Of each `pool` neighbouring rays only the nearest return is kept. Rays without a positive
+    range become points `FAR_M` away, and so do those beyond.
     """
     batch, rays = scan_m.shape
-    valid = np.isfinite(scan_m) & (scan_m > 0.0)
-    ranges = np.where(valid, scan_m, FAR_M).astype(np.float32)
+    ranges = np.minimum(np.where(scan_m > 0.0, scan_m, FAR_M), FAR_M).astype(np.float32)
     cos, sin = _directions(robot, rays)
     if pool > 1:
         groups = rays // pool
