@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from cbe.camera import CameraModel, Preprocessor, coverage
 from cbe.errors import ConfigError
 from cbe_bench.episode import Outcome, Ride, film, ride
 from cbe_bench.memory import Memory
@@ -47,6 +48,7 @@ class RunConfig:
     model: Path = PACKAGED_MODELS
     jobs: int = 0  # 0 takes a process a core
     memory: Memory = Memory.FULL
+    camera: CameraModel | None = None  # None sees just the networks' view
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
@@ -66,6 +68,8 @@ class RunConfig:
             raise ConfigError(f"unknown backend {self.backend!r}; known: {', '.join(BACKENDS)}")
         if is_scene(terms.world) and self.backend == "column":
             raise ConfigError(f"{terms.world} is a mesh scene: add --backend bullet")
+        if self.camera is not None:
+            Preprocessor(self.camera)  # refused here rather than in every process
         if self.backend == "bullet" and self.noise > 0.0:
             raise ConfigError("actuation noise is the column backend's: leave out --noise")
 
@@ -79,6 +83,7 @@ class RunConfig:
             "backend": self.backend,
             "noise": self.noise,
             "memory": self.memory.value,
+            "camera": None if self.camera is None else str(coverage(self.camera)),
         }
         return drives | terms | here
 
@@ -183,7 +188,7 @@ def _drive_group(
     with ExitStack() as places:
 
         def open_(world_seed: int) -> Place:
-            place = Place(config.terms.world, world_seed, config.backend)
+            place = Place(config.terms.world, world_seed, config.backend, config.camera)
             places.callback(place.close)
             return place
 

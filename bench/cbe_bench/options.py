@@ -1,15 +1,19 @@
 """Options that the commands of cbe-bench share, and the runs that they ask for."""
 
 import argparse
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cbe.camera import CameraModel
 from cbe_runtime.route import AttractorPrecision
 
 if TYPE_CHECKING:
     from cbe_bench.drives import Drives
     from cbe_bench.evaluation import RunConfig
     from cbe_bench.route import Teaching
+
+CAMERA_PX = 160, 120
 
 
 def add_run(parser: argparse.ArgumentParser) -> None:
@@ -33,6 +37,10 @@ def add_run(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--noise", type=float, default=0.0, metavar="S", help="actuation noise, the paper's s"
     )
+    parser.add_argument(
+        "--camera", type=_camera, metavar="WxH",
+        help="field of view of the robot's camera in degrees (the networks' own, 120x107)",
+    )  # fmt: skip
     add_model(parser)
     add_output(parser)
 
@@ -131,6 +139,7 @@ def _run(
         noise=options.noise,
         model=model(options),
         jobs=options.jobs,
+        camera=options.camera,
     )
 
 
@@ -154,3 +163,16 @@ def precisions(text: str) -> list[AttractorPrecision]:
 def _range(text: str) -> range:
     first, _, end = text.partition(":")
     return range(int(first), int(end))
+
+
+def _camera(text: str) -> CameraModel:
+    """A pinhole of so many degrees in `CAMERA_PX` pixels."""
+    across_deg, down_deg = (float(part) for part in text.split("x"))
+    if not (0.0 < across_deg < 180.0 and 0.0 < down_deg < 180.0):
+        raise argparse.ArgumentTypeError(f"degrees between 0 and 180 are needed; found {text}")
+    width, height = CAMERA_PX
+    fx, fy = (
+        0.5 * size / math.tan(math.radians(0.5 * angle))
+        for size, angle in ((width, across_deg), (height, down_deg))
+    )
+    return CameraModel(width, height, fx, fy, 0.5 * width, 0.5 * height)

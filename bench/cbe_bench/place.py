@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cbe.camera import Preprocessor
+from cbe.camera import MODEL_CAMERA, CameraModel, Preprocessor
 from cbe.errors import ConfigError
 from cbe_hil_sim.backend import Backend
 from cbe_hil_sim.column import ColumnBackend
@@ -81,13 +81,17 @@ class Place:
     `world` is what paths are sought in, of a mesh scene its free space.
     """
 
-    def __init__(self, name: str, seed: int, kind: str = "column") -> None:
+    def __init__(
+        self, name: str, seed: int, kind: str = "column", camera: CameraModel | None = None
+    ) -> None:
         """Open the world `seed` of a split, or the scene or floor plan at a path.
+
+        Without a `camera` the robot has one that sees just the networks' view.
 
         Raises:
             WorldError: it cannot be loaded.
         """
-        self._kind = kind
+        self._kind, self._camera = kind, camera
         self._scene: Scene | None = None
         if name in GENERATED:
             self.world = generate(seed)
@@ -113,8 +117,14 @@ class Place:
         """
         if self._kind == "column":
             world, batch = _with_bins(self.world, bins), None if bins else self.batch
-            nowhere_else = np.zeros(1, np.int64)
-            yield ColumnBackend([world], nowhere_else, batch=batch, noise=noise, rng=rng), _as_it_is
+            camera = self._camera or MODEL_CAMERA
+            see = Preprocessor(camera) if self._camera else _as_it_is
+            yield (
+                ColumnBackend(
+                    [world], np.zeros(1, np.int64), batch=batch, camera=camera, noise=noise, rng=rng
+                ),
+                see,
+            )
         elif not bins:
             if self._bullet is None:
                 self._bullet = self._load_bullet(())
@@ -130,12 +140,14 @@ class Place:
             self._bullet = None
 
     def _load_bullet(self, bins: Sequence[Bin]) -> "BulletBackend":
-        from cbe_hil_sim.bullet import BulletBackend
+        from cbe_hil_sim.bullet import SIM_CAMERA, BulletBackend
         from cbe_hil_sim.bulletscene import scene_from_world
 
         if self._scene is None:
-            return BulletBackend(scene_from_world(_with_bins(self.world, bins)))
-        return BulletBackend(functools.reduce(_stand_in, bins, self._scene))
+            scene = scene_from_world(_with_bins(self.world, bins))
+        else:
+            scene = functools.reduce(_stand_in, bins, self._scene)
+        return BulletBackend(scene, camera=self._camera or SIM_CAMERA)
 
 
 @functools.lru_cache(maxsize=1)

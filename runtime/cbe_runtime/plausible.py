@@ -17,8 +17,8 @@ BLANK_LEVELS = 3
 """Grey levels that the middle four fifths of a blank picture's pixels span at most."""
 BLACK_LEVEL = 8
 """A covered lens: no lit wall is as dark, however near."""
-SEEN_SHARE = 0.25
-"""Pixels that are not pure black, as what a narrow camera does not cover is."""
+SEEN_SHARE = 0.1
+"""Pixels that are not pure black, as what the narrowest camera that is accepted leaves is."""
 WALL_M = 0.5
 """A plain wall nearer than this, in most directions ahead, fills the camera's view."""
 MOVING_MPS = 0.1

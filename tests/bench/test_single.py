@@ -77,6 +77,12 @@ def test_noise_changes_the_ride_but_not_the_episode(tmp_path) -> None:
         assert one["final_error_m"] != other["final_error_m"]
 
 
+def test_narrow_camera_sees_enough_to_drive(tmp_path) -> None:
+    result = run("single", tmp_path, "--steps", "20", "--episodes", "2", "--camera", "70x55")
+    assert result["config"]["camera"] == "70 x 55 deg"
+    assert all(ride["steps"] > 0 and ride["outcome"] != "timeout" for ride in result["runs"])
+
+
 def test_compare_reads_what_single_writes(tmp_path, capsys) -> None:
     run("single", tmp_path, "--steps", "20", "--episodes", "2")
     capsys.readouterr()
@@ -99,6 +105,7 @@ def test_sweep_lists_and_draws_each_length(tmp_path) -> None:
         (("--steps", "20", "--obstacle-offset", "0.1"), "at least 21 steps"),
         (("--noise", "0.5", "--backend", "bullet"), "leave out --noise"),
         (("--world", "nowhere"), "no world 'nowhere'"),
+        (("--camera", "40x30"), "at least half of each is needed"),
     ],
 )
 def test_bad_options_are_refused_with_a_reason(options, reason, capsys) -> None:

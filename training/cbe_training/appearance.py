@@ -39,7 +39,7 @@ def sample(rng: np.random.Generator, count: int, height_m: float) -> Appearance:
     level = np.arange(256)[None, None, :] / 255.0
     tone = np.clip(gain * tint * level**gamma + offset, 0.0, 1.0) * 255.0
     narrow = rng.random(count) < 0.1  # narrower cameras leave black borders
-    border = np.stack([rng.integers(1, 13, count), rng.integers(0, 11, count)], axis=1)
+    border = np.stack([rng.integers(1, 21, count), rng.integers(0, 21, count)], axis=1)
     return Appearance(
         tone=np.round(tone).astype(np.uint8),
         noise=(rng.random(count) ** 2 * 8.0).astype(np.float32),
