@@ -6,7 +6,7 @@ PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -c const
 option = $(if $(filter-out 0,$($(1))),$(2))
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test soak check format train export bench clean
+.PHONY: help install demo test soak check format train export bench board clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -44,6 +44,15 @@ export: $(VENV)/.all ## turn the checkpoint into the shipped ONNX files, past th
 
 bench: $(VENV)/.all ## measure the speed of renderer, scanner and networks
 	$(BIN)/cbe-bench speed $(ARGS)
+
+board: $(VENV)/bin/python ## fetch the base install's wheels for 64-bit ARM, Python 3.11 to 3.13, into dist/
+	@mkdir -p dist
+	@$(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["dependencies"], sep="\n")' > dist/board.txt
+	@for version in 3.11 3.12 3.13; do \
+	  $(BIN)/python -m pip download --quiet --disable-pip-version-check -c constraints.txt -r dist/board.txt -d dist/board-$$version \
+	    --only-binary :all: --python-version $$version --platform manylinux_2_17_aarch64 --platform manylinux_2_28_aarch64 || exit 1; \
+	  $(BIN)/python -c 'import sys, zipfile; sizes = [sum(i.file_size for i in zipfile.ZipFile(p).infolist()) for p in sys.argv[2:]]; print("Python", sys.argv[1] + ":", len(sizes), "wheels, installed", sum(sizes) >> 20, "MiB")' $$version dist/board-$$version/*.whl || exit 1; \
+	done
 
 clean: ## remove .venv and what tools cached
 	rm -rf $(VENV) dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
