@@ -23,6 +23,8 @@ from cbe_hil_sim.generate import TEST_SEEDS, generate
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from cbe.inbox import Latest
+    from cbe.link import JsonObject
     from cbe_bench.demo_course import Course
 
 SIM_START_S = 180.0
@@ -116,11 +118,8 @@ def run(minutes: float, seed: int, model: Path | None, note: Callable[[str], Non
 
 def _soak(link: Link, runtime: Child, course: Course, duration_s: float) -> Soaked:
     statuses = link.latest_json("status")
-    first = statuses.wait(timeout_s=SIM_START_S)
-    if first is None or first.message is None:
-        raise ProcessError(f"the runtime says nothing:\n{runtime.tail()}")
+    before = status = _first(statuses, runtime)
     began_s, cpu_s = time.monotonic(), _cpu_s(runtime.pid)
-    before = status = first.message
     laps, lap_s = 0, -np.inf
     rss: list[float] = []
     while (now_s := time.monotonic()) - began_s < duration_s:
@@ -153,6 +152,17 @@ def _soak(link: Link, runtime: Child, course: Course, duration_s: float) -> Soak
         growth_mib=float(np.median(warm[-tenth:]) - np.median(warm[:tenth])),
         cpu=(_cpu_s(runtime.pid) - cpu_s) / wall_s,
     )
+
+
+def _first(statuses: Latest[JsonObject], runtime: Child) -> JsonObject:
+    """The first status that counts ticks; while it hangs, a runtime says no more than that."""
+    began_s, count = time.monotonic(), 0
+    while time.monotonic() - began_s < SIM_START_S:
+        heard = statuses.wait(count, POLL_S)
+        if heard is not None and heard.message is not None and "histograms" in heard.message:
+            return heard.message
+        count = heard.count if heard is not None else count
+    raise ProcessError(f"the runtime says nothing:\n{runtime.tail()}")
 
 
 def _connected(endpoint: str, sim: Child) -> Link:

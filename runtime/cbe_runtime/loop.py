@@ -89,7 +89,7 @@ class Loop:
         self._timings = Timings()
         self._heartbeat = Heartbeat()
         self._watchdog = Watchdog(self._stop_hanging)
-        self._status: dict[str, Any] = {}
+        self._status: dict[str, Any] = {"state": State.IDLE.value}
         self._stamp_ns = 0
         self._twist = Twist()
         self._received_s = -math.inf
@@ -186,8 +186,7 @@ class Loop:
         with suppress(LinkError):
             for _ in range(LAST_STOPS):
                 self._command(Twist())
-            if self._status:
-                self._statuses.put(self._status | {"state": "EXITED"})
+            self._statuses.put(self._status | {"state": "EXITED"})
 
     def _judge_done(self, decision: Decision) -> None:
         """Set the exit code and the exit, where the robot is done and it was asked for."""
