@@ -167,9 +167,14 @@ def _range(text: str) -> range:
 
 def _camera(text: str) -> CameraModel:
     """A pinhole of so many degrees in `CAMERA_PX` pixels."""
-    across_deg, down_deg = (float(part) for part in text.split("x"))
+    try:
+        across_deg, down_deg = (float(part) for part in text.split("x"))
+    except ValueError:
+        across_deg = down_deg = math.nan
     if not (0.0 < across_deg < 180.0 and 0.0 < down_deg < 180.0):
-        raise argparse.ArgumentTypeError(f"degrees between 0 and 180 are needed; found {text}")
+        raise argparse.ArgumentTypeError(
+            f"degrees between 0 and 180 are needed, such as 70x55; found {text!r}"
+        )
     width, height = CAMERA_PX
     fx, fy = (
         0.5 * size / math.tan(math.radians(0.5 * angle))

@@ -118,20 +118,17 @@ class Place:
         if self._kind == "column":
             world, batch = _with_bins(self.world, bins), None if bins else self.batch
             camera = self._camera or MODEL_CAMERA
-            see = Preprocessor(camera) if self._camera else _as_it_is
-            yield (
-                ColumnBackend(
-                    [world], np.zeros(1, np.int64), batch=batch, camera=camera, noise=noise, rng=rng
-                ),
-                see,
+            backend = ColumnBackend(
+                [world], np.zeros(1, np.int64), batch=batch, camera=camera, noise=noise, rng=rng
             )
+            yield backend, _see(camera)
         elif not bins:
             if self._bullet is None:
                 self._bullet = self._load_bullet(())
-            yield self._bullet, Preprocessor(self._bullet.camera)
+            yield self._bullet, _see(self._bullet.camera)
         else:
             with self._load_bullet(bins) as bullet:
-                yield bullet, Preprocessor(bullet.camera)
+                yield bullet, _see(bullet.camera)
 
     def close(self) -> None:
         """Release what pybullet holds."""
@@ -148,6 +145,12 @@ class Place:
         else:
             scene = functools.reduce(_stand_in, bins, self._scene)
         return BulletBackend(scene, camera=self._camera or SIM_CAMERA)
+
+
+@functools.lru_cache(maxsize=1)
+def _see(camera: CameraModel) -> See:
+    """Cached, for all episodes share a camera whose maps take milliseconds to build."""
+    return Preprocessor(camera)
 
 
 @functools.lru_cache(maxsize=1)
@@ -195,7 +198,3 @@ def _stand_in(scene: "Scene", bin_: Bin) -> "Scene":
         solid_m=np.concatenate([scene.solid_m, corners]),
         planning=bin_.in_world(scene.planning),
     )
-
-
-def _as_it_is(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return image
