@@ -23,24 +23,23 @@ def scan_points(scan_m: NDArray[np.floating], robot: Robot, pool: int = 1) -> ND
     """
     batch, rays = scan_m.shape
     ranges = np.minimum(np.where(scan_m > 0.0, scan_m, FAR_M), FAR_M).astype(np.float32)
-    cos, sin = _directions(robot, rays)
+    directions = _directions(robot, rays)
     if pool > 1:
         groups = rays // pool
         grouped = ranges[:, : groups * pool].reshape(batch, groups, pool)
         nearest = grouped.argmin(axis=-1) + np.arange(0, groups * pool, pool)  # (B, groups)
-        ranges = ranges[np.arange(batch)[:, None], nearest]
-        cos, sin = cos.take(nearest), sin.take(nearest)
-    points = np.empty((*ranges.shape, 2), np.float32)
-    points[..., 0] = robot.scan_x_m + ranges * cos
-    points[..., 1] = ranges * sin
-    return points
+        ranges = ranges.take(nearest + (np.arange(batch) * rays)[:, None])
+        directions = directions.take(nearest, axis=0)
+    points = ranges[..., None] * directions
+    points[..., 0] += robot.scan_x_m
+    return np.asarray(points)
 
 
 @lru_cache
-def _directions(robot: Robot, rays: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Cosine and sine (rays,) of each ray's angle."""
+def _directions(robot: Robot, rays: int) -> NDArray[np.float32]:
+    """Cosine and sine (rays, 2) of each ray's angle."""
     angle = robot.scan_angle_min_rad + robot.scan_angle_increment_rad * np.arange(rays)
-    return np.cos(angle).astype(np.float32), np.sin(angle).astype(np.float32)
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1).astype(np.float32)
 
 
 def along_and_across(

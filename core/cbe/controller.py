@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from cbe.arc import scan_points
 from cbe.manoeuvres import ManoeuvreGains, Manoeuvres
+from cbe.nearness import lift_places, lift_points
 from cbe.robot import STEP_S, Robot
 
 STANDSTILL_MPS = 0.02  # below it a yaw rate says nothing about the steering
 _POOL = 5  # rays to one point in the controller
-_REAR_POINTS = 4  # on each side, of 48: 100 deg and more from ahead, forward drives only leave them
 _ATTRACTED = 3  # of the control points
 _LEAST_STEERING_SPEED_MPS = 0.15  # keeps the steering's Jacobian regular from standstill
 
@@ -88,7 +88,7 @@ class RmpController:
         repelled = [0.0, 45.0, -45.0, 22.5, -22.5, 67.5, -67.5, 90.0, -90.0]
         angle = np.radians([0.0, 45.0, -45.0, *repelled])
         self._points = radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)  # (12, 2)
-        self._twice_repelled = (2.0 * self._points[_ATTRACTED:]).astype(np.float32)
+        self._repelled = lift_places(*self._points[_ATTRACTED:].T)  # (4, 9)
         weight = np.ones(len(repelled))
         weight[0] = gains.nose_weight
         weight[1:3] = gains.corner_weight
@@ -98,6 +98,11 @@ class RmpController:
         # Of attraction, and of repulsion at no distance.
         self._metric = np.append(attracted, weight * gains.repulsion_metric * reach)  # (11,)
         self._manoeuvres = Manoeuvres(robot, gains.manoeuvres)
+        # Of speed and steering, and of their rates, (2, 1).
+        self._least = np.array([[0.0], [-robot.max_steer_rad]])
+        self._most = np.array([[robot.max_speed_mps], [robot.max_steer_rad]])
+        self._least_rates = -np.array([[robot.max_braking_mps2], [robot.max_steer_rate_rad_s]])
+        self._most_rates = np.array([[robot.max_acceleration_mps2], [robot.max_steer_rate_rad_s]])
 
     def step(
         self,
@@ -111,58 +116,55 @@ class RmpController:
         inf and NaN both mean no return. A non-finite waypoint brakes to a stop.
         """
         robot = self.robot
-        known = np.isfinite(waypoint_m).all(axis=-1)
+        known = np.isfinite(waypoint_m[:, 0]) & np.isfinite(waypoint_m[:, 1])
         waypoint = np.where(known[:, None], waypoint_m, 0.0).astype(np.float64)
         points = scan_points(scan_m, robot, _POOL)
-        curvature, wanted_speed = self._choose_arc(motion, waypoint, points)
-        wanted_speed = np.where(known, wanted_speed, 0.0)
-        acceleration, steer_rate = self._resolve(motion, curvature, wanted_speed, points)
-        acceleration = _within(acceleration, -robot.max_braking_mps2, robot.max_acceleration_mps2)
-        steer_rate = _within(steer_rate, -robot.max_steer_rate_rad_s, robot.max_steer_rate_rad_s)
+        lifted = lift_points(waypoint, points)
+        present = np.tan(motion.steer_rad) / robot.wheelbase_m
+        curvature, wanted_speed = self._choose_arc(present, waypoint, lifted)
+        wanted_speed *= known
+        rates = self._resolve(motion, present, curvature, wanted_speed, points, lifted)
+        rates = np.minimum(np.maximum(rates, self._least_rates), self._most_rates)
+        then = np.array([motion.speed_mps, motion.steer_rad]) + rates * STEP_S
         # What braking can do is never traded against what attraction would like.
         floor = motion.speed_mps - robot.max_braking_mps2 * STEP_S
-        speed = np.minimum(
-            motion.speed_mps + acceleration * STEP_S, np.maximum(wanted_speed, floor)
-        )
-        steer = motion.steer_rad + steer_rate * STEP_S
-        return Motion(
-            _within(speed, 0.0, robot.max_speed_mps),
-            _within(steer, -robot.max_steer_rad, robot.max_steer_rad),
-        )
+        np.minimum(then[0], np.maximum(wanted_speed, floor), out=then[0])
+        speed, steer = np.minimum(np.maximum(then, self._least), self._most)
+        return Motion(speed, steer)
 
     def _choose_arc(
         self,
-        motion: Motion,
+        present: NDArray[np.float64],
         waypoint: NDArray[np.float64],
-        points: NDArray[np.float32],
+        lifted: NDArray[np.float32],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Curvature (B,) to steer and the speed (B,) it allows."""
+        """Curvature (B,) to steer and the speed (B,) it allows; `present` (B,) is being steered."""
         gains, robot = self.gains, self.robot
         distance = np.hypot(waypoint[:, 0], waypoint[:, 1])
         toward = _curvature_to(waypoint, distance, robot.max_curvature_per_m)
-        present = np.tan(motion.steer_rad) / robot.wheelbase_m
-        ahead = points[:, _REAR_POINTS:-_REAR_POINTS]
-        choice = self._manoeuvres.choose(toward, present, waypoint, ahead)
+        choice = self._manoeuvres.choose(toward, present, distance, lifted)
         slipped = (waypoint[:, 0] <= 0.0) & (distance < gains.slipped_m)
         reached = slipped | (distance < gains.arrived_m)
         speed = gains.waypoint_speed_per_s * distance * ~reached
         speed = np.minimum(speed, np.sqrt(2.0 * gains.braking_mps2 * choice.free_m))
-        openness = np.minimum(np.maximum(choice.clearance_m / gains.open_clearance_m, 0.0), 1.0)
         tight = gains.tight_speed_mps
-        speed = np.minimum(speed, tight + (robot.max_speed_mps - tight) * openness)
+        faster_per_m = (robot.max_speed_mps - tight) / gains.open_clearance_m
+        clearance = np.maximum(choice.clearance_m, 0.0)
+        speed = np.minimum(speed, tight + faster_per_m * clearance)
         return choice.curvature_per_m, np.minimum(speed, robot.max_speed_mps)
 
     def _resolve(
         self,
         motion: Motion,
+        present: NDArray[np.float64],
         curvature: NDArray[np.float64],
         wanted_speed: NDArray[np.float64],
         points: NDArray[np.float32],
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Acceleration (B,) m/s2 and steering rate (B,) rad/s that serve all policies best."""
+        lifted: NDArray[np.float32],
+    ) -> NDArray[np.float64]:
+        """Acceleration m/s2 and steering rate rad/s (2, B) that serve all policies best."""
         gains, wheelbase = self.gains, self.robot.wheelbase_m
         speed, steer = motion.speed_mps, motion.steer_rad
-        present = np.tan(steer) / wheelbase
         turning = np.maximum(speed, _LEAST_STEERING_SPEED_MPS)
         gain = turning / (wheelbase * np.cos(steer) ** 2)
         # A point at (x, y) moves with speed * (1 - c y, c x); its Jacobian's columns are
@@ -173,11 +175,9 @@ class RmpController:
         metric[:] = self._metric
 
         repelled = self._points[_ATTRACTED:]  # (9, 2)
-        # Squared distance but for the repelled points' own length, which changes no minimum.
-        square = points[..., 0] ** 2 + points[..., 1] ** 2  # (B, P)
-        nearest = (square[:, None] - self._twice_repelled @ points.swapaxes(1, 2)).argmin(axis=-1)
+        nearest = (lifted[:, 1:] @ self._repelled).argmin(axis=1)  # (B, 9)
         away = repelled - points[np.arange(len(points))[:, None], nearest]  # (B, 9, 2)
-        gap_m = np.sqrt(np.maximum((away * away).sum(axis=-1), 1e-6))
+        gap_m = np.maximum(np.hypot(away[..., 0], away[..., 1]), 1e-3)
         away = away / gap_m[..., None]
         x, y = repelled[:, 0], repelled[:, 1]
         across = away[..., 1] * x - away[..., 0] * y  # (B, 9)
@@ -199,7 +199,7 @@ class RmpController:
         m11, m12, m22 = sums[:, 0, 0], sums[:, 0, 1], sums[:, 1, 1]
         r1, r2 = sums[:, 0, 2], sums[:, 1, 2]
         determinant = m11 * m22 - m12 * m12
-        return (m22 * r1 - m12 * r2) / determinant, (m11 * r2 - m12 * r1) / determinant
+        return np.array([m22 * r1 - m12 * r2, m11 * r2 - m12 * r1]) / determinant
 
 
 def _within(

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cbe.nearness import lift_places
 from cbe.robot import Robot
 
 Floats = NDArray[np.floating]
@@ -17,6 +18,8 @@ SPACING_M = 0.12  # between the checked places of a manoeuvre
 FIRST_SAMPLES, SECOND_SAMPLES = 3, 7
 SAMPLES = FIRST_SAMPLES + SECOND_SAMPLES
 _OPEN_M = 10.0  # clearance and free length where nothing is near
+_REAR_POINTS = 4  # on each side, of 48: 100 deg and more from ahead, forward drives only leave them
+_DIRECT_ARCS = 257  # to the waypoint; the nearest one is less than 7 mm off at its end
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,65 +64,77 @@ class Manoeuvres:
         x = lead_x[:, -1, None, None] + np.cos(turned) * tail_x - np.sin(turned) * tail_y
         y = lead_y[:, -1, None, None] + np.sin(turned) * tail_x + np.cos(turned) * tail_y
         # (4, F * 3 + F * G * 7): the leads, each shared by G manoeuvres, then the tails.
-        x, y = np.append(lead_x, x), np.append(lead_y, y)
-        self._tree = np.stack([x, y, np.ones_like(x), x * x + y * y]).astype(np.float32)
+        self._tree = lift_places(np.append(lead_x, x), np.append(lead_y, y))
+        arcs = np.linspace(-widest, widest, _DIRECT_ARCS)
+        self._direct = lift_places(*_arc(arcs, SAMPLES)).swapaxes(0, 1).copy()  # (A, 4, 10)
+        self._arcs_per_curvature = 0.5 * (_DIRECT_ARCS - 1) / widest
         manoeuvre = np.arange(len(self._first))
         begin = manoeuvre[:, None] // gains.second_arcs * FIRST_SAMPLES + np.arange(FIRST_SAMPLES)
         end = lead_x.size + manoeuvre[:, None] * SECOND_SAMPLES + np.arange(SECOND_SAMPLES)
         direct = self._tree.shape[1] + np.arange(SAMPLES)  # the arc to the waypoint comes last
         rows = np.concatenate([np.concatenate([begin, end], axis=1), direct[None]])
         self._samples = np.ascontiguousarray(rows.T)  # (10, T + 1) places of each manoeuvre
-        self._toward_weight_m = gains.toward_weight / widest
-        self._change_weight_m = gains.change_weight / widest
-        self._travelled = (SPACING_M * np.arange(1, SAMPLES + 1)).astype(np.float32)
+        self._minded_m = (SPACING_M * (np.arange(SAMPLES) + 0.5)).astype(np.float32)
+        self._hit_m2 = np.float32((robot.body_radius_m + gains.least_clearance_m) ** 2)
+        # Free length where the first sample to hit is 0 to 9, or none.
+        self._free_m = np.append(SPACING_M * np.arange(SAMPLES), _OPEN_M)
+        # Of the change from the waypoint's curvature, that from the present one, the nearest
+        # distance to the waypoint, the squared lack of clearance, the blocked part of the way.
+        self._weights = np.array(
+            [
+                gains.toward_weight / widest,
+                gains.change_weight / widest,
+                gains.miss_weight_per_m,
+                gains.clearance_weight,
+                gains.blocked_weight,
+            ]
+        )
 
     def choose(
         self,
         toward_per_m: NDArray[np.float64],
         present_per_m: NDArray[np.float64],
-        waypoint_m: NDArray[np.float64],
-        points_m: NDArray[np.float32],
+        distance_m: NDArray[np.float64],
+        lifted: NDArray[np.float32],
     ) -> Choice:
         """Cheapest manoeuvre of each of B robots.
 
-        `toward_per_m` (B,) leads to `waypoint_m` (B, 2), `present_per_m` (B,) is being steered,
-        `points_m` (B, P, 2) is the scan, all in base_link.
+        `toward_per_m` (B,) leads to the waypoint, `distance_m` (B,) away, `present_per_m` (B,) is
+        being steered, `lifted` (B, 1 + P, 4) are waypoint and scan as of `lift_points`.
         """
         gains = self._gains
-        batch, tree = len(toward_per_m), self._tree.shape[1]
+        batch, tree = len(lifted), self._tree.shape[1]
         places = np.empty((batch, 4, tree + SAMPLES), np.float32)
         places[:, :, :tree] = self._tree
-        x, y = _arc(toward_per_m, SAMPLES)
-        places[:, 0, tree:], places[:, 1, tree:], places[:, 2, tree:] = x, y, 1.0
-        places[:, 3, tree:] = x * x + y * y
-        square = _square_m2(places, points_m, waypoint_m)
-        nearest = np.maximum(square[:, :-1].min(axis=1), 0.0)
-        sample = np.sqrt(nearest).take(self._samples, axis=1)
-        sample -= np.float32(self._robot.body_radius_m)  # (B, 10, T + 1)
-        miss = square[:, -1].take(self._samples, axis=1).min(axis=1)  # (B, T + 1)
-        miss = np.sqrt(np.maximum(miss, 0.0))
+        arc = np.rint(toward_per_m * self._arcs_per_curvature).astype(np.intp)
+        places[:, :, tree:] = self._direct.take(arc + _DIRECT_ARCS // 2, axis=0)
+        square = lifted @ places  # (B, 1 + P, N)
 
-        distance = np.hypot(waypoint_m[:, 0], waypoint_m[:, 1]).astype(np.float32)
         # A waypoint nearer than usual is the goal: nothing behind it matters.
-        beyond = gains.beyond_per_m * np.maximum(distance - gains.near_waypoint_m, 0.0)
-        horizon = np.minimum(distance + beyond, self._travelled[-1])[:, None]
-        unminded = self._travelled > horizon + np.float32(0.5 * SPACING_M)  # (B, 10)
-        sample += (unminded * np.float32(_OPEN_M))[..., None]
-        clearance = sample.min(axis=1)  # (B, T + 1)
-        hit = clearance < gains.least_clearance_m
-        free = SPACING_M * (sample < gains.least_clearance_m).argmax(axis=1)  # where it hits
+        beyond = gains.beyond_per_m * np.maximum(distance_m - gains.near_waypoint_m, 0.0)
+        horizon = np.minimum(distance_m + beyond, SPACING_M * SAMPLES)[:, None]
+        ahead = square[:, 1 + _REAR_POINTS : -_REAR_POINTS]
+        sample = ahead.min(axis=1).take(self._samples, axis=1)  # (B, 10, T + 1) m2
+        sample += ((self._minded_m > horizon) * np.float32(_OPEN_M**2))[..., None]
+        hit = np.empty((batch, SAMPLES + 1, sample.shape[2]), np.bool_)
+        hit[:, :-1], hit[:, -1] = sample < self._hit_m2, True
+        hit_at = hit.argmax(axis=1)  # (B, T + 1)
+        clearance = np.sqrt(np.maximum(sample.min(axis=1), 0.0)) - self._robot.body_radius_m
+        short = np.minimum(np.maximum(1.0 - clearance / gains.wanted_clearance_m, 0.0), 1.5)
+        miss = square[:, 0].take(self._samples, axis=1).min(axis=1)
 
-        first = np.empty((batch, len(self._first) + 1))  # (B, T + 1)
+        first = np.empty(clearance.shape)
         first[:, :-1], first[:, -1] = self._first, toward_per_m
-        short = 1.0 - clearance / gains.wanted_clearance_m
-        short = np.minimum(np.maximum(short, 0.0), 1.5)
-        blocked = hit * np.maximum(1.0 - free / np.maximum(horizon, SPACING_M), 0.0)
-        cost = self._toward_weight_m * np.abs(first - toward_per_m[:, None])
-        cost += self._change_weight_m * np.abs(first - present_per_m[:, None])
-        cost += gains.miss_weight_per_m * miss
-        cost += gains.clearance_weight * short * short + gains.blocked_weight * blocked
-        best = cost.argmin(axis=1) + np.arange(batch) * cost.shape[1]
-        free_m = np.where(hit.take(best), free.take(best), _OPEN_M)
+        terms = np.empty((batch, 5, first.shape[1]))
+        terms[:, 0] = np.abs(first - toward_per_m[:, None])
+        terms[:, 1] = np.abs(first - present_per_m[:, None])
+        terms[:, 2] = np.sqrt(np.maximum(miss, 0.0))
+        terms[:, 3] = short * short
+        terms[:, 4] = 1.0 - np.minimum(
+            self._free_m.take(hit_at) / np.maximum(horizon, SPACING_M), 1.0
+        )
+        best = (self._weights @ terms).argmin(axis=1) + np.arange(batch) * first.shape[1]
+        free_m = self._free_m.take(hit_at.take(best))
         return Choice(first.take(best), clearance.take(best), free_m)
 
 
@@ -130,21 +145,3 @@ def _arc(
     curvature = (curvature_per_m + (np.abs(curvature_per_m) < 1e-6) * 2e-6)[:, None]
     angle = curvature * (SPACING_M * np.arange(1, count + 1))
     return np.sin(angle) / curvature, (1.0 - np.cos(angle)) / curvature
-
-
-def _square_m2(
-    places: NDArray[np.float32], points: NDArray[np.float32], waypoint: NDArray[np.float64]
-) -> NDArray[np.float32]:
-    """Squared distances (B, P + 1, N) of points (B, P, 2), then waypoints (B, 2), from places.
-
-    `places` (B, 4, N) are x, y, 1, x^2 + y^2.
-    """
-    # |q - p|^2 = |q|^2 + |p|^2 - 2 p q: one product, and hardly a pass over its N columns besides.
-    batch, count = points.shape[:2]
-    ends = np.empty((batch, count + 1, 4), np.float32)
-    ends[:, :count, :2], ends[:, count, :2] = points, waypoint
-    x, y = ends[..., 0], ends[..., 1]
-    ends[..., 2] = x * x + y * y
-    ends[..., :2] *= np.float32(-2.0)
-    ends[..., 3] = 1.0
-    return np.asarray(ends @ places)
