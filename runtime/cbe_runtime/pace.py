@@ -50,7 +50,7 @@ class Ratekeeper:
 
     Within a window round its deadline a tick goes with the camera's frame, at the window's end
     without one. A frame that just missed a tick would else wait a whole period for the next. The
-    deadlines' phase slides slowly to where the frames come.
+    deadlines' phase jumps to where the first frame came, and then slides slowly to the others.
     """
 
     def __init__(
@@ -66,6 +66,7 @@ class Ratekeeper:
         self._camera = camera
         self._clock = clock
         self._due_s = clock()
+        self._in_phase = False
         self.jitter_s = 0.0
         self.overruns = 0
         """Deadlines that passed while a tick was still running."""
@@ -90,6 +91,9 @@ class Ratekeeper:
         if abs(early_s) > self._period_s:
             return 0.0  # there is none, or it is an old one
         error_s = math.remainder(early_s, self._period_s)
+        if not self._in_phase:
+            self._in_phase = True
+            return error_s
         return max(-MAX_SHIFT_S, min(SHIFT * error_s, MAX_SHIFT_S))
 
 

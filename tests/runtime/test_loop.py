@@ -386,11 +386,19 @@ def test_overrun_skips_ticks_and_never_bursts():
 
 
 @pytest.mark.parametrize("phase_s", [0.001, 0.02, 0.05, 0.08, 0.099])
-def test_ticks_slide_to_the_camera_frames_and_then_go_with_them(phase_s):
+def test_ticks_jump_to_the_first_camera_frame_and_then_go_with_them(phase_s):
     frames_s = 50.0 + phase_s + 0.1 * np.arange(100)
     began_s, ages_s, pace = run_paced(frames_s, [0.002] * 60)
-    assert ages_s[20:].max() < 1e-6
-    assert np.diff(began_s).min() > 0.07
+    assert ages_s[3:].max() < 1e-6
+    assert np.diff(began_s).min() > 0.045
+    assert np.diff(began_s)[3:].min() > 0.095
+
+
+def test_ticks_slide_to_a_camera_whose_phase_changes():
+    frames_s = np.append(50.0 + 0.1 * np.arange(20), 52.06 + 0.1 * np.arange(80))
+    began_s, ages_s, pace = run_paced(frames_s, [0.002] * 60)
+    assert ages_s[40:].max() < 1e-6
+    assert np.diff(began_s).min() > 0.1 - 2 * WINDOW_S - 0.001
     assert pace.overruns == 0
 
 
