@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cbe import signature
-from cbe_export.graphs import encoder_signature
+from cbe_export.graphs import encoder_signature, generator_signature
 from cbe_training.config import TrainConfig
 from cbe_training.drives import unseen
 from cbe_training.layout import path_of
@@ -74,10 +74,10 @@ def _run_torch(
 
     goal_z, goal = look(shown)
     z, attractor = look(images)
-    relation, steps = networks.generator.relation, len(images)
-    to_goal = relation(attractor, goal[-1:].expand(steps, -1))[None]
-    to_start = relation(attractor[:1], goal[:1])[None].expand(1, steps, -1)
-    out = networks.generator(to_goal, to_start, z, goal_z[:, -1:].expand(1, steps, -1))
+    relation = networks.generator.relation
+    to_goal = relation(attractor, goal[-1:].expand(len(images), -1))[None]
+    to_start = relation(attractor[:1], goal[:1])[None]
+    out = networks.generator(to_goal, to_start, z, goal_z[:, -1:])
     parts = [out.waypoint_m, out.progress[..., None], torch.sigmoid(out.on_route_logit)[..., None]]
     paths = path_of(z, signature.SHAPE_POINTS).flatten(-2)
     return torch.cat([*parts, z, paths], dim=-1)[0].numpy()
@@ -106,7 +106,7 @@ def _run_onnx(
 
     goal, memory = look(shown)
     _, seen = look(images)
-    state = _zeros(signature.generator(networks.config.generator_state))
+    state = _zeros(generator_signature(networks))
     state |= {
         "attractor_first": seen[0]["attractor"],
         "attractor_start": memory[0]["attractor"],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -233,7 +234,7 @@ class Networks:
         except ORT_FAULTS as fault:
             raise ModelError(f"the {name} network failed: {fault}") from fault
         # Any inf or NaN makes the sum of squares non-finite: one pass, no temporary mask.
-        if not all(np.isfinite(np.vdot(output, output)) for output in outputs):
+        if not math.isfinite(sum(float(np.vdot(output, output)) for output in outputs)):
             raise ModelError(
                 f"the {name} network put out a value that is not finite; stop and check it"
             )

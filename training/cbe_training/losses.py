@@ -126,12 +126,7 @@ def compute(
     goal_target = ends[:, 1:].expand(-1, longest, -1).flatten(0, 1)
     goal_relation = relation(attractors.flatten(0, 1), goal_target).view(count, longest, -1)
     start_relation = relation(attractors[:, 0], ends[:, 0])  # (B, relation)
-    out = networks.generator(
-        goal_relation,
-        start_relation[:, None].expand(-1, longest, -1),
-        z,
-        goal_z[:, None].expand(-1, longest, -1),
-    )
+    out = networks.generator(goal_relation, start_relation[:, None], z, goal_z[:, None])
 
     # Where the robot is lost there is no right waypoint.
     driving = batch.valid & batch.right[:, None] & (batch.on_route > 0.5)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from cbe import signature
 from cbe_training import layout, path
@@ -85,6 +86,15 @@ class Encoder(nn.Module):
         return torch.cat([traced, self.to_embedding(torch.cat([hidden, traced], dim=-1))], dim=-1)
 
 
+class Remembered(NamedTuple):
+    """What stays the same while a behavior is repeated, so that a tick need not work it out."""
+
+    start_relation: Tensor  # (B, T or 1, relation)
+    columns: Tensor  # (B, T or 1, 2, 3, 18) the path's, in the first frame and from its end
+    stride: Tensor  # (B, T or 1, 1) share of the path that a lookahead takes
+    behavior: Tensor  # (B, T or 1, 192) what z adds to the first layer that reads it
+
+
 class Guide(nn.Module):
     """Where the remembered path lies from here, and where that says to go.
 
@@ -106,38 +116,42 @@ class Guide(nn.Module):
         )
         self.size = config.guide + 6
 
+    def remember(self, start_relation: Tensor, embedding_goal: Tensor) -> tuple[Tensor, Tensor]:
+        """`Remembered.columns` and `.stride`."""
+        start = layout.frame(self._seen(start_relation))
+        columns = layout.from_start(embedding_goal), layout.from_end(embedding_goal)
+        length_m = layout.length_m(embedding_goal)
+        stride = LOOKAHEAD_M / (length_m + LOOKAHEAD_M)
+        return torch.stack([start @ columns[0], columns[1]], dim=-3), stride
+
     def forward(
-        self,
-        goal_relation: Tensor,
-        start_relation: Tensor,
-        embedding_now: Tensor,
-        embedding_goal: Tensor,
+        self, goal_relation: Tensor, embedding_now: Tensor, columns: Tensor, stride: Tensor
     ) -> Tensor:
         """As `Generator.forward`, to (B, T, size)."""
-        # (B, T, 2, 4) poses of the goal, seen from here, and the start, from the first frame.
-        seen = self.locate(torch.stack([goal_relation, start_relation], dim=-2))
-        turn = seen[..., 2:]
-        norm = torch.linalg.vector_norm(turn, dim=-1, keepdim=True)
-        seen = torch.cat([seen[..., :2], turn / (norm + 0.01)], dim=-1)
-        goal, start = layout.frame(seen).unbind(-3)
-        reckoned = layout.into(embedding_now) @ (start @ layout.from_start(embedding_goal))
-        sighted = goal @ layout.from_end(embedding_goal)
-        laid = torch.stack([reckoned, sighted], dim=-3)[..., :2, :]  # (B, T, 2, 2, 18)
-        ahead, share = self._ahead(laid[..., :PATH_POINTS], layout.length_m(embedding_goal))
+        goal = self._seen(goal_relation)
+        frames = torch.stack([layout.into(embedding_now), layout.frame(goal)], dim=-3)
+        laid = frames[..., :2, :] @ columns  # (B, T, 2, 2, 18)
+        ahead, share = self._ahead(laid[..., :PATH_POINTS], stride)
         scaled = (laid * layout.SCALE.to(laid)).flatten(-2)
         reasons = torch.cat([scaled, ahead, share], dim=-1).flatten(-2)
-        read = self.layers(torch.cat([reasons, seen[..., 0, :]], dim=-1))
+        read = self.layers(torch.cat([reasons, goal], dim=-1))
         return torch.cat([read, ahead.flatten(-2), share.flatten(-2)], dim=-1)
 
-    def _ahead(self, points: Tensor, length_m: Tensor) -> tuple[Tensor, Tensor]:
+    def _seen(self, relation: Tensor) -> Tensor:
+        """Pose (..., 4: x, y, cos, sin) that a relation shows: of the goal, or of the start."""
+        x_y, turn = self.locate(relation).split(2, dim=-1)
+        norm = torch.linalg.vector_norm(turn, dim=-1, keepdim=True)
+        return torch.cat([x_y, turn / (norm + 0.01)], dim=-1)
+
+    def _ahead(self, points: Tensor, stride: Tensor) -> tuple[Tensor, Tensor]:
         """The point (..., 2) a lookahead on from the nearest of (..., 2, P), and that one's share.
 
         All softly, so that gradients pass.
         """
         shares = torch.arange(1, PATH_POINTS + 1).to(points) / PATH_POINTS
-        near = -((points / self.nearness_m) ** 2).sum(dim=-2)
-        share = (near.softmax(dim=-1) * shares).sum(dim=-1, keepdim=True)
-        there = share + (LOOKAHEAD_M / (length_m + LOOKAHEAD_M))[..., None]
+        near = (points * points).sum(dim=-2) * -(self.nearness_m**-2)
+        share = near.softmax(dim=-1) @ shares[:, None]
+        there = share + stride[..., None]
         weights = (-((PATH_POINTS * (shares - there)) ** 2)).softmax(dim=-1)
         return (points @ weights[..., None]).squeeze(-1), share
 
@@ -170,23 +184,30 @@ class Generator(nn.Module):
         embedding_goal: Tensor,
         state: State | None = None,
     ) -> Generated:
-        """Relations (B, T, relation), embeddings (B, T, 32); the goal's may be broadcast over T."""
-        inputs = self.gather(goal_relation, start_relation, embedding_now, embedding_goal)
+        """Relations (B, T, relation), embeddings (B, T, 32); of start and goal one may do for T."""
+        remembered = self.remember(start_relation, embedding_goal)
+        inputs = self.gather(goal_relation, embedding_now, remembered)
         hidden, state = self.lstm(inputs, state)
         # The shortcut lets a reflex reach the waypoint without passing the recurrent state.
         out = self.out(self.head(torch.cat([hidden, inputs], dim=-1)))  # (B, T, 4)
         return Generated(out[..., :2], out[..., 2], out[..., 3], state)
 
+    def remember(self, start_relation: Tensor, embedding_goal: Tensor) -> Remembered:
+        """What of `forward`'s arguments stays the same from tick to tick."""
+        first = self.behavior.get_parameter("0.weight")[:, signature.EMBEDDING_SIZE :]
+        behavior = F.linear(embedding_goal, first, self.behavior.get_parameter("0.bias"))
+        columns, stride = self.guide.remember(start_relation, embedding_goal)
+        return Remembered(start_relation, columns, stride, behavior)
+
     def gather(
-        self,
-        goal_relation: Tensor,
-        start_relation: Tensor,
-        embedding_now: Tensor,
-        embedding_goal: Tensor,
+        self, goal_relation: Tensor, embedding_now: Tensor, remembered: Remembered
     ) -> Tensor:
         """What the LSTM sees of `forward`'s arguments."""
-        behavior = self.behavior(torch.cat([embedding_now, embedding_goal], dim=-1))
-        guide = self.guide(goal_relation, start_relation, embedding_now, embedding_goal)
+        start_relation, columns, stride, behavior = remembered
+        first = self.behavior.get_parameter("0.weight")[:, : signature.EMBEDDING_SIZE]
+        behavior = self.behavior[1:](F.linear(embedding_now, first) + behavior)
+        guide = self.guide(goal_relation, embedding_now, columns, stride)
+        start_relation = start_relation.expand_as(goal_relation)
         return torch.cat([goal_relation, start_relation, behavior, guide], dim=-1)
 
 

@@ -5,6 +5,7 @@ Legendre polynomials over the time gone by (as in HiPPO, Gu et al. 2020, measure
 need not learn either, and later another one can lay the whole path out again (`layout`).
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,8 @@ DEGREES = 8
 LONGEST = 256
 """Frames after which the oldest fade instead of staying exact: 51 s at the runtime's rate."""
 PLACE, PLACE_M = 4, 3.0
+_QUARTERS = 0.5 * math.pi * torch.tensor([[0.0, -1.0], [1.0, 0.0]], dtype=torch.float64)
+"""Phases by which the cosine becomes a rotation: cos, sin; -sin, cos."""
 
 
 class Path(NamedTuple):
@@ -43,15 +46,14 @@ def add_up(steps: Tensor) -> Tensor:
 
 def _turn(steps: Tensor, yaw: Tensor) -> Tensor:
     """Moves (..., 2) of `steps` (..., 3) as seen from where `yaw` (...) is 0."""
-    cos, sin = yaw.cos(), yaw.sin()
-    x, y = steps[..., 0], steps[..., 1]
-    return torch.stack([cos * x - sin * y, sin * x + cos * y], dim=-1)
+    rotation = (yaw[..., None, None] + _QUARTERS.to(yaw)).cos()  # (..., 2, 2), of row vectors
+    return (steps[..., None, :2] @ rotation).squeeze(-2)
 
 
 def place(pose: Tensor) -> Tensor:
-    """Poses (..., 3) as a network likes them: (..., 4) of unit size."""
-    yaw = pose[..., 2:]
-    return torch.cat([pose[..., :2] / PLACE_M, yaw.cos(), yaw.sin()], dim=-1)
+    """Poses (..., 3) as a network likes them: (..., 4) of unit size, with cosine and sine."""
+    turn = (pose[..., 2:] + _QUARTERS[0].to(pose)).cos()
+    return torch.cat([pose[..., :2] / PLACE_M, turn], dim=-1)
 
 
 def follow(poses: Tensor) -> Tensor:
@@ -66,10 +68,9 @@ def advance(path: Path, step: Tensor) -> Path:
     moved = _turn(step, path.pose[:, 2])
     pose = path.pose + torch.cat([moved, step[:, 2:]], dim=-1)
     point = path.pose[:, :2] + 0.5 * moved
-    keep = _KEEP.to(pose).index_select(0, frame).unflatten(-1, (DEGREES, DEGREES))
-    gain = _GAIN.to(pose).index_select(0, frame)
-    series = path.series @ keep  # (B, 2, DEGREES)
-    return Path(pose, series + point[..., None] * gain[:, None], path.frames + 1.0)
+    weights = _ADVANCE.to(pose).index_select(0, frame).unflatten(-1, (DEGREES + 1, DEGREES))
+    series = torch.cat([path.series, point[..., None]], dim=-1) @ weights  # (B, 2, DEGREES)
+    return Path(pose, series, path.frames + 1.0)
 
 
 def _between(poses: Tensor) -> Tensor:
@@ -94,20 +95,23 @@ def _from_start() -> Tensor:
     return torch.from_numpy(weights).float()
 
 
-def _recursion() -> tuple[Tensor, Tensor]:
-    """How frame t changes a row of the series: flat matrices (T, DEGREES^2), the point's share."""
+def _recursion() -> Tensor:
+    """How the series after frame t follows from the one before and the new point.
+
+    A flat matrix (DEGREES + 1, DEGREES) for each frame.
+    """
     nodes, weights = legendre.leggauss(DEGREES)
     norm = 2.0 * np.arange(DEGREES) + 1.0
-    keep, gain = np.zeros((LONGEST, DEGREES, DEGREES)), np.zeros((LONGEST, DEGREES))
+    advance = np.zeros((LONGEST, DEGREES + 1, DEGREES))
     for frame in range(1, LONGEST):
         kept = (frame - 1) / frame  # the past shrinks to this share of the time
         then = legendre.legvander(kept * (nodes + 1.0) - 1.0, DEGREES - 1)
         before = legendre.legvander(nodes, DEGREES - 1)
-        keep[frame] = norm * 0.5 * kept * np.einsum("q,qm,qn->nm", weights, then, before)
+        advance[frame, :-1] = norm * 0.5 * kept * np.einsum("q,qm,qn->nm", weights, then, before)
         ends = _integrals(np.array([kept, 1.0]))
-        gain[frame] = ends[1] - ends[0]
-    return torch.from_numpy(keep.reshape(LONGEST, -1)).float(), torch.from_numpy(gain).float()
+        advance[frame, -1] = ends[1] - ends[0]
+    return torch.from_numpy(advance.reshape(LONGEST, -1)).float()
 
 
 _FROM_START = _from_start()
-_KEEP, _GAIN = _recursion()
+_ADVANCE = _recursion()
