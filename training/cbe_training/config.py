@@ -85,7 +85,7 @@ class TrainConfig:
             return 12, 24
         if sequences < self.cloning_sequences + self.annealing_sequences:
             return 20, 40
-        return 28, 132
+        return 36, 136
 
     def expert_share(self, sequences: int) -> float:
         """Probability that a tick is driven by the expert's waypoint."""

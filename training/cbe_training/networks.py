@@ -48,7 +48,7 @@ class Encoder(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.pair = Pair(config)
-        self.odometry = nn.Linear(config.motion, 3)
+        self.odometry = nn.Sequential(nn.Linear(config.motion, 128), nn.ReLU(), nn.Linear(128, 3))
         self.lstm = nn.LSTM(config.motion + PLACE, config.encoder_state, batch_first=True)
         self.to_embedding = nn.Linear(
             config.encoder_state + TRACED, signature.EMBEDDING_SIZE - TRACED
