@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from cbe_runtime.behavior import Behavior
@@ -47,14 +47,15 @@ def advice(place: Whereabouts | None, route: Route) -> str:
 
 @dataclass(frozen=True, slots=True)
 class JoinConfig:
-    """What bounds the search; its evidence is that of `LostConfig`.
+    """What bounds the search; what makes it certain is the evidence of `LostConfig`.
 
     A tick costs one encoder and `at_once` generators at most, however long the route.
     """
 
     at_once: int = 16  # segments tried on one frame, standing
     hypotheses: int = 6  # that are kept, to be driven along
-    suspected: float = 0.35  # confidence of a first frame that is worth driving on
+    usual: float = 0.0  # log odds of `on_route` that refute nothing: midway no end is in sight
+    suspected: float = 0.5  # hope after a first frame that is worth driving on
     certain: float = 0.99
     least_ticks: int = 8  # driven before being certain
     lead: float = 6.0  # in summed log odds, that the best needs over the next; without it,
@@ -65,11 +66,15 @@ class JoinConfig:
 
 
 class Hypothesis:
-    """That the robot is on a segment: a behavior of its own, and how it has fared."""
+    """That the robot is on a segment: a behavior of its own, and how it has fared.
 
-    def __init__(self, behavior: Behavior, belief: LostBelief) -> None:
+    `belief` is what it is to drive on with, `doubt` a more lenient one that refutes it.
+    """
+
+    def __init__(self, behavior: Behavior, evidence: LostConfig, usual: float) -> None:
         self.behavior = behavior
-        self.belief = belief
+        self.belief = LostBelief(evidence, prior=0.5)
+        self.doubt = LostBelief(replace(evidence, usual=usual), prior=0.5)
         self.prediction: Prediction | None = None
         self.score = 0.0  # log odds to be on the route, summed: unlike a belief it never saturates
 
@@ -77,6 +82,7 @@ class Hypothesis:
         """Take a frame; raises ModelError."""
         self.prediction = self.behavior.follow(sight)
         self.belief.update(self.prediction.on_route)
+        self.doubt.update(self.prediction.on_route)
         self.score += log_odds(self.prediction.on_route)
 
     @property
@@ -176,7 +182,7 @@ class Search:
         del self._best[config.hypotheses :]
         self._view = sight.attractor
         if not self._untried:
-            kept = [each for each in self._best if each.place.confidence > config.suspected]
+            kept = [each for each in self._best if each.doubt.probability < 1.0 - config.suspected]
             self.failed = not kept
             if kept:  # together they begin anew, with the next frame as the first
                 self._best = [self._begin(each.behavior.segment) for each in kept]
@@ -188,16 +194,15 @@ class Search:
         for hypothesis in self._best:
             hypothesis.follow(sight)
         self._rank()
-        hopeful = [each for each in self._best if not each.belief.lost]
+        hopeful = [each for each in self._best if not each.doubt.lost]
         if not hopeful or (self._ticks >= config.most_ticks and self.found is None):
             self.failed = True
         else:
             self._best = hopeful
 
     def _begin(self, segment: int) -> Hypothesis:
-        return Hypothesis(
-            Behavior(self._networks, self._route, segment), LostBelief(self._evidence, prior=0.5)
-        )
+        behavior = Behavior(self._networks, self._route, segment)
+        return Hypothesis(behavior, self._evidence, self._config.usual)
 
     def _rank(self) -> None:
         self._best.sort(key=lambda each: -each.score)
