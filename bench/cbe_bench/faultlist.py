@@ -167,7 +167,7 @@ FAULTS: tuple[Fault, ...] = (
     _camera("hanging", _hanging),
     _camera("black", _painted(0)),
     _camera("white", _painted(255)),
-    _camera("half-occluded", _half, stops=False),
+    _camera("half-occluded", _half),
     _camera("wrong-size", _cropped),
     _camera("wrong-encoding", _unknown, raw=True),
     _camera("swapped-colours", _swapped, stops=False, raw=True),

@@ -17,6 +17,8 @@ BLANK_LEVELS = 3
 """Grey levels that the middle four fifths of a blank picture's pixels span at most."""
 BLACK_LEVEL = 8
 """A covered lens: no lit wall is as dark, however near."""
+COVERED_SHARE = 0.4
+"""Of all pixels that were ever lit, so many black at once are something before the lens."""
 SEEN_SHARE = 0.1
 """Pixels that are not pure black, as what the narrowest camera that is accepted leaves is."""
 WALL_M = 0.5
@@ -31,14 +33,16 @@ FAR_M, MANY_RAYS = 7.0, 0.1
 class PictureWatch:
     """Tells a camera that shows something from one that is covered, blinded or hangs.
 
-    A blank picture counts as lost, and so does one that is the very same as the last although
-    the robot is to drive; without another one for `fresh_s` the robot stops.
+    A blank picture counts as lost, one that something came before too, and one that is the very
+    same as the last although the robot is to drive; without another one for `fresh_s` the robot
+    stops.
     """
 
     def __init__(self, fresh_s: float) -> None:
         self._fresh_s = fresh_s
         self._stamp_ns: int | None = None
         self._image: NDArray[np.uint8] | None = None
+        self._lit: NDArray[np.bool_] | None = None  # (64, 64) pixels that ever were
         self._shown_s: float | None = None
         self._why: Reason | None = None
         self._doubted_s: float | None = None
@@ -84,7 +88,7 @@ class PictureWatch:
         speed_mps: float,
         now_s: float,
     ) -> Reason | None:
-        if is_blank(image, wall=_before_a_wall(ranges_m)):
+        if is_blank(image, wall=_before_a_wall(ranges_m)) or self._covered(image):
             return Reason.BLANK_IMAGE
         repeats = self._image is not None and np.array_equal(image, self._image)
         if not repeats or is_blank(image, wall=False):  # a plain wall looks the same all along
@@ -96,6 +100,13 @@ class PictureWatch:
             self._doubted_s = None
             return None
         return Reason.FROZEN_CAMERA if speed_mps > MOVING_MPS else None
+
+    def _covered(self, image: NDArray[np.uint8]) -> bool:
+        """Whether much is black that was lit before, in this picture or an earlier one."""
+        lit = image.max(axis=2) > BLACK_LEVEL
+        self._lit = lit if self._lit is None else self._lit | lit
+        ever = np.count_nonzero(self._lit)
+        return ever - np.count_nonzero(lit) > COVERED_SHARE * ever
 
 
 class ReturnWatch:

@@ -51,6 +51,23 @@ def test_picture_of_one_colour_stops_within_four_frames(watched, level):
     assert watched.drive(1) == [None]
 
 
+def test_lens_that_is_half_covered_stops_until_it_is_free(watched):
+    half = SCENE.copy()
+    half[:, :32] = 0
+    faults = [watched.show(np.roll(half, step, axis=0)) for step in range(5)]
+    assert faults[0] is None
+    assert faults[-1] is Reason.BLANK_IMAGE
+    assert watched.drive(1) == [None]
+
+
+def test_what_a_narrow_camera_never_sees_is_not_taken_for_covered():
+    narrow = Watched()
+    frame = plain(0)
+    for step in range(5):
+        frame[14:50, 10:54] = np.roll(SCENE, step, axis=1)[14:50, 10:54]
+        assert narrow.show(frame.copy()) is None
+
+
 def test_single_blank_picture_is_passed_over(watched):
     assert watched.show(plain(255)) is None
     assert not watched.watch.shows
