@@ -124,10 +124,27 @@ def write_graphs(
             )
         model = onnx.load(path)
         store_in_half(model)
+        strip(model.graph)
         onnx.helper.set_model_props(model, metadata)
         onnx.checker.check_model(model, full_check=True)
         onnx.save(model, path)
     return model_id
+
+
+def strip(graph: onnx.GraphProto) -> None:
+    """Leave out what the exporter notes of the code it came from, half as large as the weights."""
+    del graph.metadata_props[:]
+    del graph.value_info[:]
+    graph.doc_string = ""
+    for node in graph.node:
+        del node.metadata_props[:]
+        node.doc_string = ""
+        for attribute in node.attribute:
+            if attribute.type == onnx.AttributeProto.GRAPH:
+                strip(attribute.g)
+    for value in (*graph.input, *graph.output, *graph.initializer):
+        del value.metadata_props[:]
+        value.doc_string = ""
 
 
 def store_in_half(model: onnx.ModelProto) -> None:

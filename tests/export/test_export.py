@@ -51,6 +51,14 @@ def test_every_graph_carries_all_metadata(folder: Path) -> None:
         assert {p.key for p in model.metadata_props} >= set(signature.METADATA_KEYS)
 
 
+def test_files_say_nothing_of_the_machine_they_were_made_on(folder: Path) -> None:
+    here = str(Path(__file__).parents[2]).encode()
+    for path in folder.glob("*.onnx"):
+        data = path.read_bytes()
+        assert here not in data
+        assert b"cbe_training" not in data
+
+
 def test_onnxruntime_agrees_with_torch_through_the_recurrence(
     networks: BehaviorNetworks, folder: Path, rides: Rides
 ) -> None:
