@@ -62,11 +62,14 @@ def along_and_across(
 
 
 def free_length(
-    along_m: NDArray[np.floating], across_m: NDArray[np.floating], radius_m: float
+    along_m: NDArray[np.floating],
+    across_m: NDArray[np.floating],
+    radius_m: NDArray[np.floating] | float,
 ) -> NDArray[np.floating]:
     """Arc length (m) a disc of `radius_m` may go before it touches a point, over the last axis.
 
-    Below 0 where a point ahead is inside the disc already; inf where nothing is in the way.
+    Several radii broadcast against the points. Below 0 where a point ahead is inside the disc
+    already; inf where nothing is in the way.
     """
     reach = np.sqrt(np.maximum(radius_m**2 - across_m**2, 0.0))
     hit = (along_m > 0.0) & (across_m < radius_m)

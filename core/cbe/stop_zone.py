@@ -9,6 +9,7 @@ from cbe.robot import STEP_S, Robot
 
 MARGIN_M = 0.03  # scan noise and the grid of the ray angles
 CONTACT_MARGIN_M = 0.01
+_MARGINS_M = np.array([MARGIN_M, CONTACT_MARGIN_M])[:, None, None]
 REACTION_S = 2.0 * STEP_S  # one step to be executed, one for the scan's age
 CREEP_MPS = 0.1  # lets the robot leave a spot that is tight but free
 
@@ -19,18 +20,18 @@ def limit(motion: Motion, scan_m: NDArray[np.floating], robot: Robot) -> Motion:
     `motion` holds (B,) commands, `scan_m` (B, rays) ranges in metres: inf is no return, NaN is
     invalid. A scan whose rays are all invalid stops the robot; a non-finite command too.
     """
+    steerable = np.isfinite(motion.steer_rad)
+    steer = np.where(steerable, motion.steer_rad, 0.0)
+    steer = np.minimum(np.maximum(steer, -robot.max_steer_rad), robot.max_steer_rad)
     points = scan_points(scan_m, robot)  # (B, rays, 2)
-    steer = np.clip(motion.steer_rad, -robot.max_steer_rad, robot.max_steer_rad)
-    curvature = np.nan_to_num(np.tan(steer))[:, None] / robot.wheelbase_m
-    along, across = along_and_across(points, curvature)
-    free = np.maximum(free_length(along, across, robot.body_radius_m + MARGIN_M), 0.0)
+    along, across = along_and_across(points, np.tan(steer)[:, None] / robot.wheelbase_m)
+    free, contact = free_length(along, across, robot.body_radius_m + _MARGINS_M)
     # Speed v with v * reaction + v^2 / (2 braking) = free.
     lost = robot.max_braking_mps2 * REACTION_S
-    allowed = np.sqrt(lost**2 + 2.0 * robot.max_braking_mps2 * free) - lost
-    contact = free_length(along, across, robot.body_radius_m + CONTACT_MARGIN_M)
+    reach = np.maximum(free, 0.0)
+    allowed = np.sqrt(lost**2 + 2.0 * robot.max_braking_mps2 * reach) - lost
     creeping = contact > CREEP_MPS * REACTION_S + CREEP_MPS**2 / (2.0 * robot.max_braking_mps2)
-    allowed = np.where(creeping, np.maximum(allowed, CREEP_MPS), allowed)
-    usable = np.isfinite(motion.speed_mps) & np.isfinite(motion.steer_rad)
-    usable &= ~np.isnan(scan_m).all(axis=-1)
-    speed = np.where(usable, np.minimum(motion.speed_mps, allowed), 0.0)
-    return Motion(np.maximum(speed, 0.0), np.nan_to_num(steer))
+    allowed = np.maximum(allowed, CREEP_MPS * creeping)
+    usable = np.isfinite(motion.speed_mps) & steerable & ~np.isnan(scan_m).all(axis=-1)
+    speed = np.minimum(np.where(usable, motion.speed_mps, 0.0), allowed)
+    return Motion(np.maximum(speed, 0.0), steer)
