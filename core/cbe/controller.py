@@ -124,12 +124,12 @@ class RmpController:
         curvature, wanted_speed = self._choose_arc(present, waypoint, lifted)
         wanted_speed *= known
         rates = self._resolve(motion, present, curvature, wanted_speed, points, lifted)
-        rates = np.minimum(np.maximum(rates, self._least_rates), self._most_rates)
+        rates = _within(rates, self._least_rates, self._most_rates)
         then = np.array([motion.speed_mps, motion.steer_rad]) + rates * STEP_S
         # What braking can do is never traded against what attraction would like.
         floor = motion.speed_mps - robot.max_braking_mps2 * STEP_S
         np.minimum(then[0], np.maximum(wanted_speed, floor), out=then[0])
-        speed, steer = np.minimum(np.maximum(then, self._least), self._most)
+        speed, steer = _within(then, self._least, self._most)
         return Motion(speed, steer)
 
     def _choose_arc(
@@ -203,7 +203,9 @@ class RmpController:
 
 
 def _within(
-    value: NDArray[np.float64], low: NDArray[np.float64] | float, high: float
+    value: NDArray[np.float64],
+    low: NDArray[np.float64] | float,
+    high: NDArray[np.float64] | float,
 ) -> NDArray[np.float64]:
     """Clip; np.clip costs five times as much on a single robot's arrays."""
     return np.asarray(np.minimum(np.maximum(value, low), high))
