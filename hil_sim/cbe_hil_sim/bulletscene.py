@@ -7,15 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cbe_hil_sim.scene import Patch, Scene
-from cbe_hil_sim.world import (
-    SHADE_DOWN,
-    SHADE_NEGATIVE_X,
-    SHADE_NEGATIVE_Y,
-    SHADE_POSITIVE_X,
-    SHADE_POSITIVE_Y,
-    SHADE_UP,
-    World,
-)
+from cbe_hil_sim.world import SHADES, World
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
@@ -36,12 +28,7 @@ class _Quads:
     @property
     def shade(self) -> float:
         """Brightness by the normal."""
-        shades = (
-            (SHADE_NEGATIVE_X, SHADE_POSITIVE_X),
-            (SHADE_NEGATIVE_Y, SHADE_POSITIVE_Y),
-            (SHADE_DOWN, SHADE_UP),
-        )
-        return shades[self.axis][self.positive]
+        return SHADES[2 * self.axis + self.positive]
 
     def triangles(self) -> Floats:
         """Corners (Q * 2, 3, 3), counter-clockwise seen from outside."""

@@ -1,7 +1,8 @@
 """Compiled front-to-back march over the cells of a world: images and scans.
 
 One file, because numba's cache does not notice a change in another file; the constants
-imported here are compiled in, so delete __pycache__ after changing those.
+imported here are compiled in, so delete __pycache__ after changing those. An index made
+unsigned tells numba that it is not counted from the end.
 """
 
 import math
@@ -11,20 +12,21 @@ import numba
 import numpy as np
 
 from cbe_hil_sim.world import (
-    SHADE_DOWN,
-    SHADE_NEGATIVE_X,
-    SHADE_NEGATIVE_Y,
-    SHADE_POSITIVE_X,
-    SHADE_POSITIVE_Y,
-    SHADE_UP,
+    DOWN,
+    NEGATIVE_X,
+    NEGATIVE_Y,
+    POSITIVE_X,
+    POSITIVE_Y,
+    SHADES,
+    UP,
 )
 from cbe_hil_sim.worldbatch import HOLDS, LEVELS, REACH, TEXTURE_SIZE
 
 NEAR_M = 1e-4  # depth of the face seen by a camera that stands inside a solid
 FAR = 1e5  # keeps what a level row would hit finite
 LEVEL_START = np.array([(4**LEVELS - 4 ** (LEVELS - n)) // 3 for n in range(LEVELS)], np.int64)
-SIDE, CAP, SPAN = 0, 1, 2  # columns of WorldBatch.surface
-CEILING = 1  # and 0 the floor: columns of WorldBatch.level
+FACES = len(SHADES)
+SIDE, CAP, SPAN, FLOOR, CEILING = range(5)  # columns of WorldBatch.surface
 ALONG_X, ALONG_Y = 0, 1  # normal of a vertical face
 
 
@@ -49,41 +51,43 @@ def _advance(
     return column, row + (reach if dy >= 0.0 else -reach), to_y, ALONG_Y
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _texel(batch: Any, surface: int, footprint: float, u: float, v: float) -> Any:
+    """Return the texel of `surface` at (u, v) repeats, of the level that its footprint asks."""
+    level = np.uint64(min(max(int(footprint), 0), LEVELS - 1))
+    size = TEXTURE_SIZE >> np.int64(level)
+    across, down = math.floor(u * size) & (size - 1), ~math.floor(v * size) & (size - 1)
+    return batch.texture[surface] + LEVEL_START[level] + across * size + down
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _paint_side(
-    batch: Any, surface: int, normal: int, shade: float, u_at: float, v_at: float,
-    v_step: float, footprint: float, first: int, last: int, filled: Any, colour: Any,
+    batch: Any, surface: int, normal: int, face: int, u_at: float, v_at: float,
+    v_step: float, footprint: float, first: int, last: int, texel: Any, light: Any,
 ) -> None:  # fmt: skip
-    """Paint the open sub-rows first..last of a vertical face, from `v_at` (m) by `v_step`."""
+    """Paint the open sub-rows first..last of a vertical face; sub-row 0 is at `v_at` (m)."""
     placement = batch.placement[surface]
-    level = int(footprint + placement[5] + 0.5)
-    level = min(max(level, 0), LEVELS - 1)
+    level = min(max(int(footprint + placement[5] + 0.5), 0), LEVELS - 1)
     size = TEXTURE_SIZE >> level
     mask = size - 1
-    start = batch.texture[surface] + LEVEL_START[level]
     u = (u_at - placement[1 if normal == ALONG_X else 0]) * placement[3]
-    start += (math.floor(u * size) & mask) * size
+    start = batch.texture[surface] + LEVEL_START[level] + (math.floor(u * size) & mask) * size
     v_scale = placement[4] * size
     v = (v_at - placement[2]) * v_scale
     v_step *= v_scale
-    red = np.float32(batch.tint[surface, 0] * shade)
-    green = np.float32(batch.tint[surface, 1] * shade)
-    blue = np.float32(batch.tint[surface, 2] * shade)
-    white = np.float32(255.0)
+    lit = FACES * surface + face
     for sub_row in range(first, last + 1):
-        if filled[sub_row] == 0:
-            filled[sub_row] = 1
-            texel = start + (~math.floor(v + (sub_row - first) * v_step) & mask)
-            colour[sub_row, 0] = min(batch.texels[texel, 0] * red, white)
-            colour[sub_row, 1] = min(batch.texels[texel, 1] * green, white)
-            colour[sub_row, 2] = min(batch.texels[texel, 2] * blue, white)
+        at = np.uint64(sub_row)
+        if texel[at] < 0:
+            texel[at] = start + (~math.floor(v + sub_row * v_step) & mask)
+            light[at] = lit
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _paint_plane(
-    batch: Any, surface: int, shade: float, x_m: float, y_m: float, dx_m: float, dy_m: float,
+    batch: Any, surface: int, face: int, x_m: float, y_m: float, dx_m: float, dy_m: float,
     rise_m: float, depth_per_rise: Any, footprint: Any, first: int, last: int,
-    filled: Any, colour: Any,
+    texel: Any, light: Any,
 ) -> None:  # fmt: skip
     """Paint the open sub-rows first..last of a horizontal plane `rise_m` above the camera."""
     placement = batch.placement[surface]
@@ -92,61 +96,80 @@ def _paint_plane(
     du = rise_m * dx_m * placement[3]
     dv = rise_m * dy_m * placement[4]
     detail = math.log2(max(abs(rise_m), NEAR_M)) + placement[5] + 0.5
-    start = batch.texture[surface]
-    red = np.float32(batch.tint[surface, 0] * shade)
-    green = np.float32(batch.tint[surface, 1] * shade)
-    blue = np.float32(batch.tint[surface, 2] * shade)
-    white = np.float32(255.0)
+    lit = FACES * surface + face
     for sub_row in range(first, last + 1):
-        if filled[sub_row] == 0:
-            filled[sub_row] = 1
-            level = min(max(int(footprint[sub_row] + detail), 0), LEVELS - 1)
-            size = TEXTURE_SIZE >> level
-            mask = size - 1
-            depth = depth_per_rise[sub_row]
-            across = math.floor((u + depth * du) * size) & mask
-            down = ~math.floor((v + depth * dv) * size) & mask
-            texel = start + LEVEL_START[level] + across * size + down
-            colour[sub_row, 0] = min(batch.texels[texel, 0] * red, white)
-            colour[sub_row, 1] = min(batch.texels[texel, 1] * green, white)
-            colour[sub_row, 2] = min(batch.texels[texel, 2] * blue, white)
+        at = np.uint64(sub_row)
+        if texel[at] < 0:
+            depth = depth_per_rise[at]
+            texel[at] = _texel(
+                batch, surface, footprint[at] + detail, u + depth * du, v + depth * dv
+            )
+            light[at] = lit
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _paint_open(
     batch: Any, world: int, x: float, y: float, dx: float, dy: float, camera_x_m: float,
     camera_y_m: float, camera_z_m: float, dx_m: float, dy_m: float, middle: float,
-    depth_per_rise: Any, footprint: Any, filled: Any, colour: Any,
+    depth_per_rise: Any, footprint: Any, texel: Any, light: Any,
 ) -> None:  # fmt: skip
-    """Paint the floor and the ceiling where the column is still open, in runs of one surface."""
+    """Paint the floor and the ceiling where the column is still open."""
     rows, columns = batch.shape[world]
-    first_cell, first_surface = batch.first_cell[world], batch.first_surface[world]
-    sub_rows = len(filled)
+    first_cell, first_kind = batch.first_cell[world], batch.first_kind[world]
+    first_surface = batch.first_surface[world]
+    sub_rows = len(texel)
     horizon = min(max(math.ceil(middle), 0), sub_rows)
-    for plane in range(2):
-        rise, shade, first, end = -camera_z_m, SHADE_UP, horizon, sub_rows
+    for plane in (FLOOR, CEILING):
+        rise, face, first, end = -camera_z_m, UP, horizon, sub_rows
         if plane == CEILING:
-            rise, shade, first, end = batch.ceiling_m[world] - camera_z_m, SHADE_DOWN, 0, horizon
-        surface = np.int64(-1)
+            rise, face, first, end = batch.ceiling_m[world] - camera_z_m, DOWN, 0, horizon
+        log2_rise = math.log2(max(abs(rise), NEAR_M))
+        known = -1
+        surface = lit = 0
+        u = v = du = dv = detail = 0.0
         for sub_row in range(first, end):
-            if filled[sub_row] == 0:
-                depth = rise * depth_per_rise[sub_row]
-                column = min(max(math.floor(x + depth * dx), 0), columns - 1)
-                row = min(max(math.floor(y + depth * dy), 0), rows - 1)
-                here = np.int64(batch.level[first_cell + row * columns + column, plane])
-                if here != surface:
-                    if surface >= 0:
-                        _paint_plane(
-                            batch, first_surface + surface, shade, camera_x_m, camera_y_m,
-                            dx_m, dy_m, rise, depth_per_rise, footprint, first, sub_row - 1,
-                            filled, colour,
-                        )  # fmt: skip
-                    surface, first = here, sub_row
-        if surface >= 0:
-            _paint_plane(
-                batch, first_surface + surface, shade, camera_x_m, camera_y_m, dx_m, dy_m,
-                rise, depth_per_rise, footprint, first, end - 1, filled, colour,
-            )  # fmt: skip
+            at = np.uint64(sub_row)
+            if texel[at] >= 0:
+                continue
+            depth = rise * depth_per_rise[at]
+            column = min(max(math.floor(x + depth * dx), 0), columns - 1)
+            row = min(max(math.floor(y + depth * dy), 0), rows - 1)
+            kind = int(batch.kind[np.uint64(first_cell + row * columns + column)])
+            if kind != known:
+                known, surface = kind, first_surface + batch.surface[first_kind + kind, plane]
+                placement = batch.placement[surface]
+                u = (camera_x_m - placement[0]) * placement[3]
+                v = (camera_y_m - placement[1]) * placement[4]
+                du = dx_m * placement[3]
+                dv = dy_m * placement[4]
+                detail = log2_rise + placement[5] + 0.5
+                lit = FACES * surface + face
+            texel[at] = _texel(
+                batch, surface, footprint[at] + detail, u + depth * du, v + depth * dv
+            )
+            light[at] = lit
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _colour(texels: Any, lights: Any, texel: Any, light: Any, pixels: Any) -> None:
+    """Fill a column of pixels (h, 3) with the mean of what its rays (n, h * n) meet."""
+    supersample = len(texel)
+    scale, half, white = np.float32(1.0 / supersample**2), np.float32(0.5), np.float32(255.0)
+    one, two, sub_row = np.uint64(1), np.uint64(2), np.uint64(0)
+    for pixel_row in range(len(pixels)):
+        red = green = blue = np.float32(0.0)
+        for _ in range(supersample):
+            for column in range(supersample):
+                sub_column = np.uint64(column)
+                at = np.uint64(3 * np.int64(texel[sub_column, sub_row]))
+                lit = np.uint64(3 * np.int64(light[sub_column, sub_row]))
+                red += min(texels[at] * lights[lit], white)
+                green += min(texels[at + one] * lights[lit + one], white)
+                blue += min(texels[at + two] * lights[lit + two], white)
+            sub_row += one
+        pixels[pixel_row, 0] = np.uint8(red * scale + half)
+        pixels[pixel_row, 1] = np.uint8(green * scale + half)
+        pixels[pixel_row, 2] = np.uint8(blue * scale + half)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -156,7 +179,8 @@ def _render_image(
 ) -> None:  # fmt: skip
     """Render one view; intrinsics are those of the super-sampled image."""
     rows, columns = batch.shape[world]
-    first_cell, first_surface = batch.first_cell[world], batch.first_surface[world]
+    first_cell, first_kind = batch.first_cell[world], batch.first_kind[world]
+    first_surface = batch.first_surface[world]
     cell_m, ceiling_m = batch.resolution_m[world], batch.ceiling_m[world]
     x = (camera_x_m - batch.origin_m[world, 0]) / cell_m
     y = (camera_y_m - batch.origin_m[world, 1]) / cell_m
@@ -172,20 +196,19 @@ def _render_image(
         slope = (middle - sub_row) / fy
         depth_per_rise[sub_row] = 1.0 / slope if abs(slope) > 1.0 / FAR else FAR
         footprint[sub_row] = 1.5 * math.log2(abs(depth_per_rise[sub_row])) - log2_focal
-    filled = np.empty(sub_rows, np.uint8)
-    colour = np.empty((sub_rows, 3), np.float32)
-    total = np.zeros((image.shape[0], 3), np.float32)
-    scale = np.float32(1.0 / (supersample * supersample))
+    texels = np.empty((supersample, sub_rows), np.int32)  # met by each ray; -1: open
+    lights = np.empty((supersample, sub_rows), np.int32)
 
     for sub_column in range(image.shape[1] * supersample):
-        filled[:] = 0
+        texel, light = texels[sub_column % supersample], lights[sub_column % supersample]
+        texel[:] = -1
         left = (cx - (sub_column + 0.5)) / fx
         dx_m, dy_m = cos - sin * left, sin + cos * left
         dx, dy = dx_m / cell_m, dy_m / cell_m
         per_dx = 1.0 / dx if dx != 0.0 else np.inf
         per_dy = 1.0 / dy if dy != 0.0 else np.inf
-        shade_x = SHADE_NEGATIVE_X if dx > 0.0 else SHADE_POSITIVE_X
-        shade_y = SHADE_NEGATIVE_Y if dy > 0.0 else SHADE_POSITIVE_Y
+        face_x = NEGATIVE_X if dx > 0.0 else POSITIVE_X
+        face_y = NEGATIVE_Y if dy > 0.0 else POSITIVE_Y
         # A wall seen at a slant covers more of itself in one column.
         slant_x = -0.5 * math.log2(max(abs(dx_m), 1e-3)) - log2_focal
         slant_y = -0.5 * math.log2(max(abs(dy_m), 1e-3)) - log2_focal
@@ -209,26 +232,27 @@ def _render_image(
                         cell = first_cell + row * columns + column
                     solid_before = span_bottom_before = span_top_before = 0.0
                     continue
-                heights = batch.heights_m[cell]
+                heights = batch.heights_m[first_kind + batch.kind[cell]]
                 solid, span_bottom, span_top = heights[0], heights[1], heights[2]
+            kind = first_kind + batch.kind[cell]
             near = max(near, NEAR_M)
             far = max(far, near)
             per_m = fy / near  # sub-rows per metre of height at the near edge
             top = max(top, math.ceil(middle - (ceiling_m - camera_z_m) * per_m))
             bottom = min(bottom, math.floor(middle + camera_z_m * per_m))
 
-            shade, along_m = shade_x, camera_y_m + near * dy_m
+            side, along_m = face_x, camera_y_m + near * dy_m
             slant = slant_x
             if normal == ALONG_Y:
-                shade, along_m, slant = shade_y, camera_x_m + near * dx_m, slant_y
+                side, along_m, slant = face_y, camera_x_m + near * dx_m, slant_y
             if solid > solid_before:
                 first = max(top, math.ceil(middle - (solid - camera_z_m) * per_m))
                 last = min(bottom, math.floor(middle - (solid_before - camera_z_m) * per_m))
                 if first <= last:
                     _paint_side(
-                        batch, first_surface + batch.surface[cell, SIDE], normal, shade, along_m,
-                        camera_z_m + (middle - first) / per_m, -1.0 / per_m,
-                        math.log2(near) + slant, first, last, filled, colour,
+                        batch, first_surface + batch.surface[kind, SIDE], normal, side, along_m,
+                        camera_z_m + middle / per_m, -1.0 / per_m,
+                        math.log2(near) + slant, first, last, texel, light,
                     )  # fmt: skip
             if solid >= ceiling_m:
                 break
@@ -238,15 +262,15 @@ def _render_image(
                 last = min(bottom, math.floor(middle - (span_bottom - camera_z_m) * per_m))
                 if first <= last:
                     _paint_side(
-                        batch, first_surface + batch.surface[cell, SPAN], normal, shade, along_m,
-                        camera_z_m + (middle - first) / per_m, -1.0 / per_m,
-                        math.log2(near) + slant, first, last, filled, colour,
+                        batch, first_surface + batch.surface[kind, SPAN], normal, side, along_m,
+                        camera_z_m + middle / per_m, -1.0 / per_m,
+                        math.log2(near) + slant, first, last, texel, light,
                     )  # fmt: skip
 
             for face in range(3):  # nearest first: span's top, span's underside, solid's cap
-                height_m, surface, shade = span_top, SPAN, SHADE_UP
+                height_m, surface, side = span_top, SPAN, UP
                 if face == 1:
-                    height_m, shade = span_bottom, SHADE_DOWN
+                    height_m, side = span_bottom, DOWN
                 elif face == 2:
                     height_m, surface = solid, CAP
                 rise, under = height_m - camera_z_m, face == 1
@@ -259,14 +283,14 @@ def _render_image(
                 if first > last:
                     continue
                 _paint_plane(
-                    batch, first_surface + batch.surface[cell, surface], shade, camera_x_m,
+                    batch, first_surface + batch.surface[kind, surface], side, camera_x_m,
                     camera_y_m, dx_m, dy_m, rise, depth_per_rise, footprint, first, last,
-                    filled, colour,
+                    texel, light,
                 )  # fmt: skip
 
-            while top <= bottom and filled[top] != 0:
+            while top <= bottom and texel[top] >= 0:
                 top += 1
-            while top <= bottom and filled[bottom] != 0:
+            while top <= bottom and texel[bottom] >= 0:
                 bottom -= 1
             if top > bottom:
                 break
@@ -278,21 +302,10 @@ def _render_image(
 
         _paint_open(
             batch, world, x, y, dx, dy, camera_x_m, camera_y_m, camera_z_m, dx_m, dy_m, middle,
-            depth_per_rise, footprint, filled, colour,
+            depth_per_rise, footprint, texel, light,
         )  # fmt: skip
-        sub_row = 0
-        for pixel_row in range(image.shape[0]):
-            for _ in range(supersample):
-                for channel in range(3):
-                    total[pixel_row, channel] += colour[sub_row, channel]
-                sub_row += 1
         if (sub_column + 1) % supersample == 0:
-            pixel_column = sub_column // supersample
-            for pixel_row in range(image.shape[0]):
-                for channel in range(3):
-                    mean = total[pixel_row, channel] * scale
-                    image[pixel_row, pixel_column, channel] = np.uint8(mean + np.float32(0.5))
-            total[:] = 0.0
+            _colour(batch.texels, batch.light, texels, lights, image[:, sub_column // supersample])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", parallel=True)
@@ -331,7 +344,7 @@ def scan_rays(
             while distance <= range_m and 0 <= column < columns and 0 <= row < rows:
                 cell = first_cell + row * columns + column
                 if batch.skip[cell] & HOLDS:
-                    heights = batch.heights_m[cell]
+                    heights = batch.heights_m[batch.first_kind[world] + batch.kind[cell]]
                     if heights[0] >= height_m or heights[1] <= height_m <= heights[2]:
                         break
                 column, row, distance, _ = _advance(

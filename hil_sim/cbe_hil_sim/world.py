@@ -12,10 +12,9 @@ RESOLUTION_M = 0.05
 BLOCKING_HEIGHT_M = 1.1  # the camera's mast must pass under what hangs (design: robot body)
 FLOOR_TOLERANCE_M = 0.03  # lower edges are driven over
 
-# Brightness of a face by its outward normal, as a fixed directional light would give.
-SHADE_POSITIVE_X, SHADE_NEGATIVE_X = 0.95, 0.82
-SHADE_POSITIVE_Y, SHADE_NEGATIVE_Y = 1.0, 0.88
-SHADE_UP, SHADE_DOWN = 1.0, 0.7
+# Faces by their outward normal, and how bright a fixed directional light makes each.
+NEGATIVE_X, POSITIVE_X, NEGATIVE_Y, POSITIVE_Y, DOWN, UP = range(6)
+SHADES = (0.82, 0.95, 0.88, 1.0, 0.7, 1.0)
 BIN_SIZE_M = (0.3, 0.3, 1.0)  # the paper's trash can
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from cbe.errors import WorldError
-from cbe_hil_sim.world import World
+from cbe_hil_sim.world import SHADES, World
 
 TEXTURE_SIZE = 128
 LEVELS = 8  # 128, 64, ..., 1 texels wide
@@ -17,31 +17,35 @@ TEXELS = sum((TEXTURE_SIZE >> level) ** 2 for level in range(LEVELS))
 
 HOLDS = 0x80  # bit of `WorldBatch.skip`: the cell holds something
 REACH = 0x7F  # its other bits
+KINDS = 1 << 16  # of cells in a world at most
 
 _pyramids: dict[int, tuple[weakref.ref[NDArray[np.uint8]], NDArray[np.uint8]]] = {}
 
 
 class WorldBatch(NamedTuple):
-    """W worlds, their C cells and S surfaces one after the other.
+    """W worlds, their C cells, K kinds of cells and S surfaces one after the other.
 
-    A cell of world w is `first_cell[w] + row * shape[w, 1] + column`; its surface s is row
-    `first_surface[w] + s` of the surface arrays. A tuple, because numba takes it as it is.
+    A cell of world w is `first_cell[w] + row * shape[w, 1] + column`; its kind k is row
+    `first_kind[w] + k` of the kinds' arrays: few bytes a cell keep what a ray passes in the
+    processor's cache. A kind's surface s is row `first_surface[w] + s` of the surface arrays.
+    A tuple, because numba takes it as it is.
     """
 
     first_cell: NDArray[np.int64]  # (W,)
+    first_kind: NDArray[np.int64]  # (W,)
     first_surface: NDArray[np.int64]  # (W,)
     shape: NDArray[np.int64]  # (W, 2) rows, columns
     origin_m: NDArray[np.float64]  # (W, 2)
     resolution_m: NDArray[np.float64]  # (W,)
     ceiling_m: NDArray[np.float64]  # (W,)
     skip: NDArray[np.uint8]  # (C,) HOLDS, and cells (diagonals as one) to one unlike it
-    heights_m: NDArray[np.float32]  # (C, 3) solid top, span bottom, span top
-    surface: NDArray[np.uint16]  # (C, 3) solid side, solid cap, span
-    level: NDArray[np.uint16]  # (C, 2) surfaces of floor, ceiling
+    kind: NDArray[np.uint16]  # (C,)
+    heights_m: NDArray[np.float32]  # (K, 3) solid top, span bottom, span top
+    surface: NDArray[np.uint16]  # (K, 5) of solid side, solid cap, span, floor, ceiling
     texture: NDArray[np.int64]  # (S,) first texel
     placement: NDArray[np.float32]  # (S, 6) origin x, y, z; repeats a metre u, v; log2 texels/m
-    tint: NDArray[np.float32]  # (S, 3)
-    texels: NDArray[np.uint8]  # (T * TEXELS, 3), see `pyramid`
+    light: NDArray[np.float32]  # (S * 6 * 3,) RGB factors of each face: tint times its shade
+    texels: NDArray[np.uint8]  # (T * TEXELS * 3,), see `pyramid`
 
     @classmethod
     def pack(cls, worlds: Sequence[World]) -> "WorldBatch":
@@ -64,18 +68,19 @@ class WorldBatch(NamedTuple):
         ]
         return cls(
             first_cell=np.cumsum([0, *shapes.prod(axis=1)[:-1]]).astype(np.int64),
+            first_kind=np.cumsum([0, *(len(part[2]) for part in cells[:-1])]).astype(np.int64),
             first_surface=np.cumsum([0, *counts[:-1]]).astype(np.int64),
             shape=shapes,
             origin_m=np.array([world.origin_m for world in worlds], np.float64),
             resolution_m=np.array([world.resolution_m for world in worlds], np.float64),
             ceiling_m=np.array([world.ceiling_m for world in worlds], np.float64),
             skip=np.concatenate([part[0] for part in cells]),
-            heights_m=np.concatenate([part[1] for part in cells]),
-            surface=np.concatenate([part[2] for part in cells]),
-            level=np.concatenate([part[3] for part in cells]),
+            kind=np.concatenate([part[1] for part in cells]),
+            heights_m=np.concatenate([part[2] for part in cells]),
+            surface=np.concatenate([part[3] for part in cells]),
             texture=np.concatenate(texture),
             placement=np.concatenate([_pack_placement(world) for world in worlds]),
-            tint=np.concatenate([w.surfaces.tint for w in worlds]).astype(np.float32),
+            light=np.concatenate([_pack_light(world) for world in worlds]),
             texels=pyramids[0] if len(pyramids) == 1 else np.concatenate(pyramids),
         )
 
@@ -97,7 +102,7 @@ class WorldBatch(NamedTuple):
 
 
 def pyramid(textures: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Mip-maps of (N, 128, 128, 3) textures as (N * TEXELS, 3).
+    """Mip-maps of (N, 128, 128, 3) textures as (N * TEXELS * 3,).
 
     Each texture's levels follow one another, largest first, each box-filtered from the one
     before. A level is stored column by column, since a wall is painted down a column.
@@ -115,7 +120,7 @@ def pyramid(textures: NDArray[np.uint8]) -> NDArray[np.uint8]:
         exact = exact.reshape(count, half, 2, half, 2, 3).mean(axis=(2, 4))  # (N, n/2, n/2, 3)
         levels.append(np.rint(exact).astype(np.uint8))
     flat = [level.reshape(count, -1, 3) for level in levels]  # (N, n * n, 3)
-    return np.concatenate(flat, axis=1).reshape(-1, 3)  # (N * TEXELS, 3)
+    return np.concatenate(flat, axis=1).ravel()
 
 
 def _cached_pyramid(textures: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -131,18 +136,20 @@ def _cached_pyramid(textures: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 def _pack_cells(
     world: World,
-) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint16], NDArray[np.uint16]]:
-    """Return one world's `skip` (C,), `heights_m` (C, 3), `surface` (C, 3) and `level` (C, 2)."""
+) -> tuple[NDArray[np.uint8], NDArray[np.uint16], NDArray[np.float32], NDArray[np.uint16]]:
+    """Return one world's `skip` (C,), `kind` (C,), `heights_m` (K, 3) and `surface` (K, 5)."""
     ceiling = np.float32(world.ceiling_m)
     solid = np.clip(world.solid_top_m, 0.0, ceiling)
     span_bottom = np.maximum(world.span_bottom_m, solid)
     span_top = np.minimum(world.span_top_m, ceiling)
     span_top = np.where(span_top > span_bottom, span_top, 0.0)
     heights = np.stack([solid, span_bottom, span_top], axis=-1).astype(np.float32)
-    faces = (world.solid_side, world.solid_cap, world.span_surface)
-    surface = np.stack(faces, axis=-1).astype(np.uint16)
-    level = np.stack([world.floor_surface, world.ceiling_surface], axis=-1).astype(np.uint16)
-    highest = max(surface.max(initial=0), level.max(initial=0))
+    surfaces = (
+        world.solid_side, world.solid_cap, world.span_surface, world.floor_surface,
+        world.ceiling_surface,
+    )  # fmt: skip
+    surface = np.stack(surfaces, axis=-1).astype(np.uint16)
+    highest = surface.max(initial=0)
     known, used = len(world.surfaces.texture), world.surfaces.texture
     if highest >= known:
         raise WorldError(f"world {world.name!r} uses surface {highest}; its table has {known}")
@@ -153,12 +160,33 @@ def _pack_cells(
         )
     holds = (solid > 0.0) | (span_top > 0.0)
     # What a ray inside a cell can meet; where it is alike all round, one step crosses it all.
-    inside = np.concatenate([heights, surface[..., 1:]], axis=-1)
+    inside = np.concatenate([heights, surface[..., 1:3]], axis=-1)
     skip = _reach(np.where(holds[..., None], inside, 0.0)) | np.where(holds, HOLDS, 0)
+    heights, surface = heights.reshape(-1, 3), surface.reshape(-1, 5)
+    example, kind = _kinds(np.concatenate([heights.view(np.uint16), surface], axis=-1))
+    if len(example) > KINDS:
+        raise WorldError(
+            f"world {world.name!r} has {len(example)} kinds of cells (heights and surfaces); "
+            f"expected at most {KINDS}: round its heights"
+        )
     return (
-        skip.astype(np.uint8).ravel(), heights.reshape(-1, 3), surface.reshape(-1, 3),
-        level.reshape(-1, 2),
+        skip.astype(np.uint8).ravel(), kind.astype(np.uint16), heights[example], surface[example],
     )  # fmt: skip
+
+
+def _kinds(rows: NDArray[np.uint16]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Of rows (C, n), where each different one first stands (K,), and which each is (C,).
+
+    As numpy.unique along an axis, and several times faster: four columns at a time.
+    """
+    example, kind = np.zeros(1, np.intp), np.zeros(len(rows), np.intp)
+    words = np.pad(rows, ((0, 0), (0, -rows.shape[1] % 4)))
+    for word in words.view(np.uint64).T:
+        values, value = np.unique(word, return_inverse=True)
+        _, example, kind = np.unique(
+            kind * len(values) + value, return_index=True, return_inverse=True
+        )
+    return example, kind
 
 
 def _reach(content: NDArray[np.floating]) -> NDArray[np.int64]:
@@ -170,6 +198,13 @@ def _reach(content: NDArray[np.floating]) -> NDArray[np.int64]:
     alike[1:-1, 1:-1] = level[:-2] & level[1:-1] & level[2:] & (down[:-1] & down[1:])[:, 1:-1]
     distance: NDArray[np.int64] = ndimage.distance_transform_cdt(alike, metric="chessboard")
     return np.minimum(distance + 1, REACH)
+
+
+def _pack_light(world: World) -> NDArray[np.float32]:
+    """Return (S * 6 * 3,): what a texel's RGB is multiplied by on each face of each surface."""
+    tint = world.surfaces.tint.astype(np.float64)  # (S, 3)
+    light: NDArray[np.float64] = tint[:, None] * np.array(SHADES)[:, None]  # (S, 6, 3)
+    return light.astype(np.float32).ravel()
 
 
 def _pack_placement(world: World) -> NDArray[np.float32]:

@@ -259,3 +259,30 @@ def test_surface_without_entry_is_refused() -> None:
     world = replace(world, solid_cap=world.solid_cap + np.uint16(SURFACES))
     with pytest.raises(WorldError, match="its table has"):
         WorldBatch.pack([world])
+
+
+def test_more_kinds_of_cells_than_an_index_holds_are_refused() -> None:
+    world = small_world(0, flat_textures())
+    heights = np.linspace(0.1, 2.0, 300 * 300, dtype=np.float32).reshape(300, 300)
+    flat = np.zeros((300, 300), np.uint16)
+    empty = np.zeros_like(heights)
+    world = replace(
+        world, solid_top_m=heights, span_bottom_m=empty, span_top_m=empty, solid_side=flat,
+        solid_cap=flat, span_surface=flat, floor_surface=flat, ceiling_surface=flat,
+    )  # fmt: skip
+    with pytest.raises(WorldError, match=r"has 90000 kinds of cells.*at most 65536"):
+        WorldBatch.pack([world])
+
+
+def test_a_cell_of_a_batch_keeps_its_heights_and_surfaces() -> None:
+    worlds = [small_world(seed, flat_textures()) for seed in (0, 1)]
+    batch = WorldBatch.pack(worlds)
+    for number, world in enumerate(worlds):
+        cells = slice(batch.first_cell[number], batch.first_cell[number] + world.solid_side.size)
+        kind = batch.first_kind[number] + batch.kind[cells].astype(int)
+        assert np.array_equal(batch.heights_m[kind, 0], world.solid_top_m.ravel())
+        grids = (
+            world.solid_side, world.solid_cap, world.span_surface, world.floor_surface,
+            world.ceiling_surface,
+        )  # fmt: skip
+        assert np.array_equal(batch.surface[kind], np.stack([g.ravel() for g in grids], axis=1))
