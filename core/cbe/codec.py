@@ -89,6 +89,12 @@ class Message(ABC):
         """Inverse of `_to_ros`."""
 
 
+def prepare(*types: type[Message]) -> None:
+    """Compile these types' codecs now (10 ms each), so that no first message waits for it."""
+    for each in types:
+        _typestore().get_msgdef(each.TYPE)
+
+
 def new(name: str, *values: object) -> object:
     """The codec's object of a type, from all its fields in order."""
     return cast(Any, _typestore().types[name])(*values)

@@ -20,7 +20,7 @@ from cbe_hil_sim.world import (
     SHADES,
     UP,
 )
-from cbe_hil_sim.worldbatch import HOLDS, LEVELS, REACH, TEXTURE_SIZE
+from cbe_hil_sim.worldbatch import BLOCK, BLOCK_BITS, HOLDS, LEVELS, REACH, TEXTURE_SIZE
 
 NEAR_M = 1e-4  # depth of the face seen by a camera that stands inside a solid
 FAR = 1e5  # keeps what a level row would hit finite
@@ -28,6 +28,15 @@ LEVEL_START = np.array([(4**LEVELS - 4 ** (LEVELS - n)) // 3 for n in range(LEVE
 FACES = len(SHADES)
 SIDE, CAP, SPAN, FLOOR, CEILING = range(5)  # columns of WorldBatch.surface
 ALONG_X, ALONG_Y = 0, 1  # normal of a vertical face
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _cell(first_cell: int, columns: int, row: int, column: int) -> Any:
+    """Index of a cell in its batch; grids are stored in blocks, row by row of each."""
+    blocks = (columns + BLOCK - 1) >> BLOCK_BITS  # side by side
+    block = (row >> BLOCK_BITS) * blocks + (column >> BLOCK_BITS)
+    within = ((row & (BLOCK - 1)) << BLOCK_BITS) + (column & (BLOCK - 1))
+    return np.uint64(first_cell + (block << (2 * BLOCK_BITS)) + within)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -134,7 +143,7 @@ def _paint_open(
             depth = rise * depth_per_rise[at]
             column = min(max(math.floor(x + depth * dx), 0), columns - 1)
             row = min(max(math.floor(y + depth * dy), 0), rows - 1)
-            kind = int(batch.kind[np.uint64(first_cell + row * columns + column)])
+            kind = int(batch.kind[_cell(first_cell, columns, row, column)])
             if kind != known:
                 known, surface = kind, first_surface + batch.surface[first_kind + kind, plane]
                 placement = batch.placement[surface]
@@ -150,10 +159,11 @@ def _paint_open(
             light[at] = lit
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _colour(texels: Any, lights: Any, texel: Any, light: Any, pixels: Any) -> None:
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _colour(
+    supersample: int, texels: Any, lights: Any, texel: Any, light: Any, pixels: Any
+) -> None:
     """Fill a column of pixels (h, 3) with the mean of what its rays (n, h * n) meet."""
-    supersample = len(texel)
     scale, half, white = np.float32(1.0 / supersample**2), np.float32(0.5), np.float32(255.0)
     one, two, sub_row = np.uint64(1), np.uint64(2), np.uint64(0)
     for pixel_row in range(len(pixels)):
@@ -214,7 +224,8 @@ def _render_image(
         slant_y = -0.5 * math.log2(max(abs(dy_m), 1e-3)) - log2_focal
         column, row = math.floor(x), math.floor(y)
         inside = 0 <= column < columns and 0 <= row < rows
-        cell = first_cell + min(max(row, 0), rows - 1) * columns + min(max(column, 0), columns - 1)
+        nearest_row, nearest_column = min(max(row, 0), rows - 1), min(max(column, 0), columns - 1)
+        cell = _cell(first_cell, columns, nearest_row, nearest_column)
         near, normal = NEAR_M, ALONG_X
         top, bottom = 0, sub_rows - 1  # sub-rows that may still be open
         solid_before = span_bottom_before = span_top_before = 0.0
@@ -229,7 +240,7 @@ def _render_image(
                     column, row, near, normal = next_column, next_row, far, next_normal
                     inside = 0 <= column < columns and 0 <= row < rows
                     if inside:
-                        cell = first_cell + row * columns + column
+                        cell = _cell(first_cell, columns, row, column)
                     solid_before = span_bottom_before = span_top_before = 0.0
                     continue
                 heights = batch.heights_m[first_kind + batch.kind[cell]]
@@ -298,14 +309,18 @@ def _render_image(
             solid_before, span_bottom_before, span_top_before = solid, span_bottom, span_top
             inside = 0 <= column < columns and 0 <= row < rows
             if inside:
-                cell = first_cell + row * columns + column
+                cell = _cell(first_cell, columns, row, column)
 
         _paint_open(
             batch, world, x, y, dx, dy, camera_x_m, camera_y_m, camera_z_m, dx_m, dy_m, middle,
             depth_per_rise, footprint, texel, light,
         )  # fmt: skip
         if (sub_column + 1) % supersample == 0:
-            _colour(batch.texels, batch.light, texels, lights, image[:, sub_column // supersample])
+            pixels = image[:, sub_column // supersample]
+            if supersample == 2:  # a constant unrolls the loops
+                _colour(2, batch.texels, batch.light, texels, lights, pixels)
+            else:
+                _colour(supersample, batch.texels, batch.light, texels, lights, pixels)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", parallel=True)
@@ -342,7 +357,7 @@ def scan_rays(
             column, row = math.floor(x), math.floor(y)
             distance = 0.0
             while distance <= range_m and 0 <= column < columns and 0 <= row < rows:
-                cell = first_cell + row * columns + column
+                cell = _cell(first_cell, columns, row, column)
                 if batch.skip[cell] & HOLDS:
                     heights = batch.heights_m[batch.first_kind[world] + batch.kind[cell]]
                     if heights[0] >= height_m or heights[1] <= height_m <= heights[2]:

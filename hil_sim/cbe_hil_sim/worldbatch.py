@@ -2,7 +2,7 @@
 
 import weakref
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,8 @@ TEXTURE_SIZE = 128
 LEVELS = 8  # 128, 64, ..., 1 texels wide
 TEXELS = sum((TEXTURE_SIZE >> level) ** 2 for level in range(LEVELS))
 
+BLOCK_BITS = 3
+BLOCK = 1 << BLOCK_BITS  # cells along the side of a block
 HOLDS = 0x80  # bit of `WorldBatch.skip`: the cell holds something
 REACH = 0x7F  # its other bits
 KINDS = 1 << 16  # of cells in a world at most
@@ -25,9 +27,9 @@ _pyramids: dict[int, tuple[weakref.ref[NDArray[np.uint8]], NDArray[np.uint8]]] =
 class WorldBatch(NamedTuple):
     """W worlds, their C cells, K kinds of cells and S surfaces one after the other.
 
-    A cell of world w is `first_cell[w] + row * shape[w, 1] + column`; its kind k is row
-    `first_kind[w] + k` of the kinds' arrays: few bytes a cell keep what a ray passes in the
-    processor's cache. A kind's surface s is row `first_surface[w] + s` of the surface arrays.
+    The cells of world w begin at `first_cell[w]`, in blocks of 8 x 8; a cell's kind k is row
+    `first_kind[w] + k` of the kinds' arrays, and a kind's surface s is row `first_surface[w] + s`
+    of the surface arrays. Blocks, and few bytes a cell, keep what a ray passes in the cache.
     A tuple, because numba takes it as it is.
     """
 
@@ -67,7 +69,7 @@ class WorldBatch(NamedTuple):
             for world in worlds
         ]
         return cls(
-            first_cell=np.cumsum([0, *shapes.prod(axis=1)[:-1]]).astype(np.int64),
+            first_cell=np.cumsum([0, *(len(part[0]) for part in cells[:-1])]).astype(np.int64),
             first_kind=np.cumsum([0, *(len(part[2]) for part in cells[:-1])]).astype(np.int64),
             first_surface=np.cumsum([0, *counts[:-1]]).astype(np.int64),
             shape=shapes,
@@ -169,9 +171,16 @@ def _pack_cells(
             f"world {world.name!r} has {len(example)} kinds of cells (heights and surfaces); "
             f"expected at most {KINDS}: round its heights"
         )
-    return (
-        skip.astype(np.uint8).ravel(), kind.astype(np.uint16), heights[example], surface[example],
-    )  # fmt: skip
+    grid = kind.astype(np.uint16).reshape(skip.shape)
+    return _in_blocks(skip.astype(np.uint8)), _in_blocks(grid), heights[example], surface[example]
+
+
+def _in_blocks(grid: NDArray[Any]) -> NDArray[Any]:
+    """Lay a grid out block by block: what a ray passes in any direction lies close together."""
+    rows, columns = grid.shape
+    grid = np.pad(grid, ((0, -rows % BLOCK), (0, -columns % BLOCK)))
+    blocks = grid.reshape(-(-rows // BLOCK), BLOCK, -1, BLOCK).transpose(0, 2, 1, 3)
+    return blocks.ravel()
 
 
 def _kinds(rows: NDArray[np.uint16]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

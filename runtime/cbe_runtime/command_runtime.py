@@ -10,12 +10,14 @@ from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING
 
+from cbe.codec import prepare
 from cbe.errors import ConfigError
 from cbe.link import Link
+from cbe.messages import CameraInfo, CompressedImage, Image, LaserScan, TwistStamped
 from cbe.robot import Robot
 from cbe.topics import FRESH_S
 from cbe_runtime import options as shared
-from cbe_runtime import routefile
+from cbe_runtime import routefile, scheduling
 from cbe_runtime.bookmark import SUFFIX, Bookmark
 from cbe_runtime.follower import Follower, FollowerConfig
 from cbe_runtime.linkkeeper import LinkKeeper
@@ -156,12 +158,16 @@ def run(options: argparse.Namespace) -> int:
         patience_s=options.patience,
     )
     received = exit_on_signals(exiting)
+    prepare(CompressedImage, Image, CameraInfo, LaserScan, TwistStamped)
+    if not config.lockstep:
+        scheduling.run_first()  # before the link starts its threads
     with Link.open(shared.link_config(options)) as link:
         sensors = Sensors(link, View(camera), robot, options.max_latency)
         watch = bookmark.keep if bookmark else None
         loop = Loop(link, follower, sensors, config, exiting, watch)
         # A simulator in lock-step may be silent for long.
         keeper = nullcontext() if config.lockstep else LinkKeeper(link)
+        scheduling.settle()
         with keeper, bookmark or nullcontext(), beside(options):
             code = loop.run()
     if received and options.exit_when_done:

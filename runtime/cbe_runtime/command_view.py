@@ -9,14 +9,13 @@ from threading import Event, Thread
 
 from cbe.link import Link
 from cbe_runtime import options as shared
+from cbe_runtime import scheduling
 from cbe_runtime.command_runtime import exit_on_signals
 from cbe_runtime.liveview import LOOPBACK, LiveView
 from cbe_runtime.viewprocess import PORT
 
 logger = logging.getLogger(__name__)
 
-NICE = 10
-"""A runtime's view gives way to it."""
 PARENT_POLL_S = 0.5
 
 DESCRIPTION = (
@@ -51,7 +50,7 @@ def run(options: argparse.Namespace) -> int:
     ending = Event()
     exit_on_signals(ending)
     if options.parent is not None:
-        os.nice(NICE)
+        scheduling.run_last()
         Thread(target=_outlive, args=(options.parent, ending), daemon=True).start()
     with Link.open(shared.link_config(options)) as link:
         view = LiveView(link, options.host, options.port, options.twist)

@@ -18,6 +18,12 @@ CELL_M = 0.25
 SURFACES = 12
 
 
+GRIDS = (
+    "solid_top_m", "span_bottom_m", "span_top_m", "solid_side", "solid_cap", "span_surface",
+    "floor_surface", "ceiling_surface",
+)  # fmt: skip
+
+
 def flat_textures() -> NDArray[np.uint8]:
     """Return one plain texture for each surface, no two colours alike under any shade."""
     colours = np.random.default_rng(3).integers(40, 250, (SURFACES, 3)).astype(np.uint8)
@@ -274,15 +280,11 @@ def test_more_kinds_of_cells_than_an_index_holds_are_refused() -> None:
         WorldBatch.pack([world])
 
 
-def test_a_cell_of_a_batch_keeps_its_heights_and_surfaces() -> None:
-    worlds = [small_world(seed, flat_textures()) for seed in (0, 1)]
-    batch = WorldBatch.pack(worlds)
-    for number, world in enumerate(worlds):
-        cells = slice(batch.first_cell[number], batch.first_cell[number] + world.solid_side.size)
-        kind = batch.first_kind[number] + batch.kind[cells].astype(int)
-        assert np.array_equal(batch.heights_m[kind, 0], world.solid_top_m.ravel())
-        grids = (
-            world.solid_side, world.solid_cap, world.span_surface, world.floor_surface,
-            world.ceiling_surface,
-        )  # fmt: skip
-        assert np.array_equal(batch.surface[kind], np.stack([g.ravel() for g in grids], axis=1))
+def test_cells_alike_share_a_kind() -> None:
+    world = small_world(0, flat_textures())
+    batch = WorldBatch.pack([world, world])
+    assert len(batch.kind) == len(batch.skip) == 2 * 16 * 24  # 16 x 20 cells in blocks of 8 x 8
+    assert np.isin(world.solid_top_m, batch.heights_m[:, 0]).all()
+    assert np.array_equal(batch.kind[: 16 * 24], batch.kind[16 * 24 :])
+    plain = replace(world, **{name: np.zeros_like(getattr(world, name)) for name in GRIDS})
+    assert len(WorldBatch.pack([plain]).heights_m) == 1

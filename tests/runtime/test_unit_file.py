@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from cbe_runtime.scheduling import PRIORITY
 from cbe_runtime.watchdog import END_S
 
 UNIT = Path(__file__).parents[2] / "runtime" / "systemd" / "cbe-runtime.service"
@@ -48,6 +49,8 @@ def test_unit_is_hardened_and_restarts_what_failed(service):
         "CapabilityBoundingSet": "",
         "MemoryMax": "512M",
         "CPUQuota": "100%",
+        "CPUSchedulingPolicy": "fifo",
+        "CPUSchedulingPriority": str(PRIORITY),
     }
     assert {name: service[name] for name in expected} == expected
 
