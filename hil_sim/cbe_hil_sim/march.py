@@ -61,15 +61,6 @@ def _advance(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _texel(batch: Any, surface: int, footprint: float, u: float, v: float) -> Any:
-    """Return the texel of `surface` at (u, v) repeats, of the level that its footprint asks."""
-    level = np.uint64(min(max(int(footprint), 0), LEVELS - 1))
-    size = TEXTURE_SIZE >> np.int64(level)
-    across, down = math.floor(u * size) & (size - 1), ~math.floor(v * size) & (size - 1)
-    return batch.texture[surface] + LEVEL_START[level] + across * size + down
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _paint_side(
     batch: Any, surface: int, normal: int, face: int, u_at: float, v_at: float,
     v_step: float, footprint: float, first: int, last: int, texel: Any, light: Any,
@@ -105,14 +96,17 @@ def _paint_plane(
     du = rise_m * dx_m * placement[3]
     dv = rise_m * dy_m * placement[4]
     detail = math.log2(max(abs(rise_m), NEAR_M)) + placement[5] + 0.5
+    start = batch.texture[surface]
     lit = FACES * surface + face
     for sub_row in range(first, last + 1):
         at = np.uint64(sub_row)
         if texel[at] < 0:
+            level = np.uint64(min(max(int(footprint[at] + detail), 0), LEVELS - 1))
+            size = TEXTURE_SIZE >> np.int64(level)
             depth = depth_per_rise[at]
-            texel[at] = _texel(
-                batch, surface, footprint[at] + detail, u + depth * du, v + depth * dv
-            )
+            across = math.floor((u + depth * du) * size) & (size - 1)
+            down = ~math.floor((v + depth * dv) * size) & (size - 1)
+            texel[at] = start + LEVEL_START[level] + across * size + down
             light[at] = lit
 
 
@@ -134,8 +128,8 @@ def _paint_open(
             rise, face, first, end = batch.ceiling_m[world] - camera_z_m, DOWN, 0, horizon
         log2_rise = math.log2(max(abs(rise), NEAR_M))
         known = -1
-        surface = lit = 0
-        u = v = du = dv = detail = 0.0
+        surface = lit = start = size = 0
+        u = v = du = dv = detail = finer = coarser = 0.0
         for sub_row in range(first, end):
             at = np.uint64(sub_row)
             if texel[at] >= 0:
@@ -144,18 +138,24 @@ def _paint_open(
             column = min(max(math.floor(x + depth * dx), 0), columns - 1)
             row = min(max(math.floor(y + depth * dy), 0), rows - 1)
             kind = int(batch.kind[_cell(first_cell, columns, row, column)])
-            if kind != known:
+            extent = footprint[at]
+            if kind != known or not finer <= extent < coarser:
                 known, surface = kind, first_surface + batch.surface[first_kind + kind, plane]
                 placement = batch.placement[surface]
-                u = (camera_x_m - placement[0]) * placement[3]
-                v = (camera_y_m - placement[1]) * placement[4]
-                du = dx_m * placement[3]
-                dv = dy_m * placement[4]
                 detail = log2_rise + placement[5] + 0.5
+                level = min(max(int(extent + detail), 0), LEVELS - 1)
+                finer = level - detail if level > 0 else -np.inf
+                coarser = level + 1 - detail if level < LEVELS - 1 else np.inf
+                size = int(TEXTURE_SIZE) >> level
+                u = (camera_x_m - placement[0]) * placement[3] * size
+                v = (camera_y_m - placement[1]) * placement[4] * size
+                du = dx_m * placement[3] * size
+                dv = dy_m * placement[4] * size
+                start = batch.texture[surface] + LEVEL_START[level]
                 lit = FACES * surface + face
-            texel[at] = _texel(
-                batch, surface, footprint[at] + detail, u + depth * du, v + depth * dv
-            )
+            across = math.floor(u + depth * du) & (size - 1)
+            down = ~math.floor(v + depth * dv) & (size - 1)
+            texel[at] = start + across * size + down
             light[at] = lit
 
 
@@ -219,9 +219,6 @@ def _render_image(
         per_dy = 1.0 / dy if dy != 0.0 else np.inf
         face_x = NEGATIVE_X if dx > 0.0 else POSITIVE_X
         face_y = NEGATIVE_Y if dy > 0.0 else POSITIVE_Y
-        # A wall seen at a slant covers more of itself in one column.
-        slant_x = -0.5 * math.log2(max(abs(dx_m), 1e-3)) - log2_focal
-        slant_y = -0.5 * math.log2(max(abs(dy_m), 1e-3)) - log2_focal
         column, row = math.floor(x), math.floor(y)
         inside = 0 <= column < columns and 0 <= row < rows
         nearest_row, nearest_column = min(max(row, 0), rows - 1), min(max(column, 0), columns - 1)
@@ -253,9 +250,9 @@ def _render_image(
             bottom = min(bottom, math.floor(middle + camera_z_m * per_m))
 
             side, along_m = face_x, camera_y_m + near * dy_m
-            slant = slant_x
+            slant = max(abs(dx_m), 1e-3)  # at a slant, one column covers more of a wall
             if normal == ALONG_Y:
-                side, along_m, slant = face_y, camera_x_m + near * dx_m, slant_y
+                side, along_m, slant = face_y, camera_x_m + near * dx_m, max(abs(dy_m), 1e-3)
             if solid > solid_before:
                 first = max(top, math.ceil(middle - (solid - camera_z_m) * per_m))
                 last = min(bottom, math.floor(middle - (solid_before - camera_z_m) * per_m))
@@ -263,7 +260,8 @@ def _render_image(
                     _paint_side(
                         batch, first_surface + batch.surface[kind, SIDE], normal, side, along_m,
                         camera_z_m + middle / per_m, -1.0 / per_m,
-                        math.log2(near) + slant, first, last, texel, light,
+                        0.5 * math.log2(near * near / slant) - log2_focal, first, last,
+                        texel, light,
                     )  # fmt: skip
             if solid >= ceiling_m:
                 break
@@ -275,7 +273,8 @@ def _render_image(
                     _paint_side(
                         batch, first_surface + batch.surface[kind, SPAN], normal, side, along_m,
                         camera_z_m + middle / per_m, -1.0 / per_m,
-                        math.log2(near) + slant, first, last, texel, light,
+                        0.5 * math.log2(near * near / slant) - log2_focal, first, last,
+                        texel, light,
                     )  # fmt: skip
 
             for face in range(3):  # nearest first: span's top, span's underside, solid's cap

@@ -87,8 +87,9 @@ def test_siblings_at_one_hub_hear_each_other(hub: Link, client: Link, endpoint: 
 @pytest.mark.parametrize("topic", [CMD_VEL, CMD_VEL_UNSTAMPED])
 def test_bare_names_are_published_without_attachment(topic: Any, endpoint: str, hub: Link) -> None:
     samples: list[zenoh.Sample] = []
-    hub._session.declare_subscriber(f"{topic.name}", samples.append)
     message = command(0.5) if topic is CMD_VEL else Twist.planar(0.5, 0.0)
+    topic = replace(topic, name=f"bare/{topic.message.__name__}")
+    hub._session.declare_subscriber(topic.name, samples.append)
     with Link.open(LinkConfig(connect=(endpoint,), style=KeyStyle.BARE)) as bare:
         publisher = bare.publisher(topic)
         until(lambda: samples, lambda: publisher.put(message))
