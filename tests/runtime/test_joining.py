@@ -148,3 +148,28 @@ def test_share_of_the_route_counts_steps(route):
 def test_advice_names_the_likeliest_place(route):
     assert "segment 2 of 2, 75 % of the way" in advice(Whereabouts(1, 0.5, 0.4), route)
     assert "start" in advice(None, route)
+
+
+def test_hypothesis_that_is_merely_unsure_midway_is_followed_on(networks, route, says):
+    likely, _ = says
+    likely[3] = 0.8
+    search = search_of(networks, route_of(route, 5))
+    look(search, 2)
+    likely[3] = 0.55  # the belief to drive on calls this lost
+    look(search, 20)
+    assert not search.failed
+    assert search.found is None
+    assert search.place.segment == 3
+    likely[3] = 0.99
+    look(search, 30)
+    assert search.found.behavior.segment == 3
+
+
+def test_hypothesis_that_is_refuted_is_given_up(networks, route, says):
+    likely, _ = says
+    likely[3] = 0.8
+    search = search_of(networks, route_of(route, 5))
+    look(search, 2)
+    likely[3] = 0.05
+    look(search)
+    assert search.failed
