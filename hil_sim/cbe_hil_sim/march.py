@@ -3,6 +3,9 @@
 One file, because numba's cache does not notice a change in another file; the constants
 imported here are compiled in, so delete __pycache__ after changing those. An index made
 unsigned tells numba that it is not counted from the end.
+
+Each image column is marched front to back: painting notes the texel that a ray meets and the
+light on it, and what no nearer face has painted is open. Colours are read only then.
 """
 
 import math
@@ -324,11 +327,15 @@ def _render_image(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", parallel=True)
 def render_images(
-    batch: Any, world_index: Any, camera_pose: Any, camera_z_m: Any, horizon_px: Any,
+    batch: Any, world_index: Any, order: Any, camera_pose: Any, camera_z_m: Any, horizon_px: Any,
     fx: float, fy: float, cx: float, supersample: int, images: Any,
 ) -> None:  # fmt: skip
-    """Fill images (B, h, w, 3) from camera poses (B, 3); horizon_px (B,) is the row of level."""
-    for b in numba.prange(len(images)):
+    """Fill images (B, h, w, 3), one after the other in `order`, from camera poses (B, 3).
+
+    horizon_px (B,) is the row of level.
+    """
+    for k in numba.prange(len(images)):
+        b = order[k]
         _render_image(
             batch, world_index[b], camera_pose[b, 0], camera_pose[b, 1], camera_pose[b, 2],
             camera_z_m[b], fx * supersample, fy * supersample, cx * supersample,

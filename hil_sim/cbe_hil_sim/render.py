@@ -49,9 +49,10 @@ def render(
     horizon_px = np.full(count, float(camera.cy))
     if pitch_px is not None:
         horizon_px += pitch_px
+    order = np.argsort(world_index, kind="stable")  # a world's textures stay in the cache
     images = np.empty((count, camera.height, camera.width, 3), np.uint8)
     render_images(
-        batch, world_index, camera_pose, camera_z_m, horizon_px, float(camera.fx),
+        batch, world_index, order, camera_pose, camera_z_m, horizon_px, float(camera.fx),
         float(camera.fy), float(camera.cx), supersample, images,
     )  # fmt: skip
     return images
