@@ -11,6 +11,7 @@ logger = logging.getLogger(__name__)
 PRIORITY = 1
 """The lowest of SCHED_FIFO: before every ordinary process, after the drivers' threads."""
 NICE = 10
+"""A runtime's view gives way to it."""
 
 
 def run_first() -> bool:

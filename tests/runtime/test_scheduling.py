@@ -4,16 +4,18 @@ import subprocess
 import sys
 import textwrap
 
+from cbe_runtime.scheduling import NICE
+
 PRELUDE = """
 import os, threading
 from cbe_runtime import scheduling
 """
 
 
-def printed(code: str, *prefix: str) -> list[str]:
+def printed(code: str) -> list[str]:
     program = PRELUDE + textwrap.dedent(code)
     done = subprocess.run(
-        [*prefix, sys.executable, "-c", program], capture_output=True, text=True, timeout=60,
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60,
         check=True,
     )  # fmt: skip
     return done.stdout.split()
@@ -52,7 +54,7 @@ def test_the_view_beside_yields_to_all():
             os._exit(0)
         os.wait()
     """
-    assert printed(code) == ["0", str(10)]
+    assert printed(code) == ["0", str(NICE)]
 
 
 def test_settling_takes_what_exists_out_of_collections():
