@@ -15,28 +15,21 @@ FAR_M = 100.0
 """Range put in place of rays without a return: beyond any scanner, still finite."""
 
 
-def scan_points(scan_m: NDArray[np.floating], robot: Robot, pool: int = 1) -> NDArray[np.float32]:
-    """Returns of scans (B, rays) as base_link points (B, rays // pool, 2).
-
-    Of each `pool` neighbouring rays only the nearest return is kept. Rays without a positive
-    range become points `FAR_M` away, and so do those beyond.
-    """
-    batch, rays = scan_m.shape
-    ranges = np.minimum(np.where(scan_m > 0.0, scan_m, FAR_M), FAR_M).astype(np.float32)
-    directions = _directions(robot, rays)
-    if pool > 1:
-        groups = rays // pool
-        grouped = ranges[:, : groups * pool].reshape(batch, groups, pool)
-        nearest = grouped.argmin(axis=-1) + np.arange(0, groups * pool, pool)  # (B, groups)
-        ranges = ranges.take(nearest + (np.arange(batch) * rays)[:, None])
-        directions = directions.take(nearest, axis=0)
-    points = ranges[..., None] * directions
+def scan_points(scan_m: NDArray[np.floating], robot: Robot) -> NDArray[np.float32]:
+    """Returns of scans (B, rays) as base_link points (B, rays, 2)."""
+    ranges = finite_ranges(scan_m)
+    points = ranges[..., None] * ray_directions(robot, scan_m.shape[-1])
     points[..., 0] += robot.scan_x_m
     return np.asarray(points)
 
 
+def finite_ranges(scan_m: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Ranges (...) in metres; what is not positive, NaN or beyond `FAR_M` becomes `FAR_M`."""
+    return np.minimum(np.where(scan_m > 0.0, scan_m, FAR_M), FAR_M).astype(np.float32)
+
+
 @lru_cache
-def _directions(robot: Robot, rays: int) -> NDArray[np.float32]:
+def ray_directions(robot: Robot, rays: int) -> NDArray[np.float32]:
     """Cosine and sine (rays, 2) of each ray's angle."""
     angle = robot.scan_angle_min_rad + robot.scan_angle_increment_rad * np.arange(rays)
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1).astype(np.float32)

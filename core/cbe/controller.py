@@ -10,19 +10,18 @@ that arc is not blindly the one to the waypoint but the first of the manoeuvre t
 (`cbe.manoeuvres`), which steers round what mere repulsion only brakes for.
 """
 
+import math
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cbe.arc import scan_points
-from cbe.manoeuvres import ManoeuvreGains, Manoeuvres
+from cbe.manoeuvres import Choice, ManoeuvreGains, Manoeuvres
 from cbe.nearness import lift_places, lift_points
 from cbe.robot import STEP_S, Robot
 
 STANDSTILL_MPS = 0.02  # below it a yaw rate says nothing about the steering
-_POOL = 5  # rays to one point in the controller
-_ATTRACTED = 3  # of the control points
 _LEAST_STEERING_SPEED_MPS = 0.15  # keeps the steering's Jacobian regular from standstill
 
 
@@ -72,7 +71,7 @@ def motion_from_twist(
     moving = np.abs(speed_mps) > STANDSTILL_MPS
     curvature = yaw_rate_rad_s / np.where(moving, speed_mps, 1.0)
     steer = np.arctan(curvature * robot.wheelbase_m)
-    steer = _within(steer, -robot.max_steer_rad, robot.max_steer_rad)
+    steer = np.minimum(np.maximum(steer, -robot.max_steer_rad), robot.max_steer_rad)
     return Motion(speed_mps, np.where(moving, steer, previous_steer_rad))
 
 
@@ -84,25 +83,17 @@ class RmpController:
         self.robot = robot = robot or Robot()
         self.gains = gains = gains or RmpGains()
         radius = robot.body_radius_m
-        # Nose and front corners are attracted; nine points round the front half are repelled.
-        repelled = [0.0, 45.0, -45.0, 22.5, -22.5, 67.5, -67.5, 90.0, -90.0]
-        angle = np.radians([0.0, 45.0, -45.0, *repelled])
-        self._points = radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)  # (12, 2)
-        self._repelled = lift_places(*self._points[_ATTRACTED:].T)  # (4, 9)
-        weight = np.ones(len(repelled))
-        weight[0] = gains.nose_weight
-        weight[1:3] = gains.corner_weight
-        reach = np.exp(gains.repulsion_decay_per_m * gains.repulsion_reach_m)
-        spread_m2 = (self._points[:_ATTRACTED] ** 2).sum()
-        attracted = (float(_ATTRACTED), float(spread_m2))
-        # Of attraction, and of repulsion at no distance.
-        self._metric = np.append(attracted, weight * gains.repulsion_metric * reach)  # (11,)
+        # Nose and front corners are attracted; their metrics, summed at base_link and abreast.
+        self._ahead, self._abreast = 3.0, 3.0 * radius * radius
+        # Nine points round the front half are repelled: x, y and the metric at no distance.
+        angle = np.radians([0.0, 45.0, -45.0, 22.5, -22.5, 67.5, -67.5, 90.0, -90.0])
+        x, y = radius * np.cos(angle), radius * np.sin(angle)
+        metric = math.exp(gains.repulsion_decay_per_m * gains.repulsion_reach_m)
+        metric *= gains.repulsion_metric
+        most = metric * np.array([gains.nose_weight, *[gains.corner_weight] * 2, *[1.0] * 6])
+        self._repelled = list(zip(x.tolist(), y.tolist(), most.tolist(), strict=True))
+        self._lifted = lift_places(x, y).T.copy()  # (9, 4)
         self._manoeuvres = Manoeuvres(robot, gains.manoeuvres)
-        # Of speed and steering, and of their rates, (2, 1).
-        self._least = np.array([[0.0], [-robot.max_steer_rad]])
-        self._most = np.array([[robot.max_speed_mps], [robot.max_steer_rad]])
-        self._least_rates = -np.array([[robot.max_braking_mps2], [robot.max_steer_rate_rad_s]])
-        self._most_rates = np.array([[robot.max_acceleration_mps2], [robot.max_steer_rate_rad_s]])
 
     def step(
         self,
@@ -116,107 +107,114 @@ class RmpController:
         inf and NaN both mean no return. A non-finite waypoint brakes to a stop.
         """
         robot = self.robot
-        known = np.isfinite(waypoint_m[:, 0]) & np.isfinite(waypoint_m[:, 1])
-        waypoint = np.where(known[:, None], waypoint_m, 0.0).astype(np.float64)
-        points = scan_points(scan_m, robot, _POOL)
-        lifted = lift_points(waypoint, points)
-        present = np.tan(motion.steer_rad) / robot.wheelbase_m
-        curvature, wanted_speed = self._choose_arc(present, waypoint, lifted)
-        wanted_speed *= known
-        rates = self._resolve(motion, present, curvature, wanted_speed, points, lifted)
-        rates = _within(rates, self._least_rates, self._most_rates)
-        then = np.array([motion.speed_mps, motion.steer_rad]) + rates * STEP_S
-        # What braking can do is never traded against what attraction would like.
-        floor = motion.speed_mps - robot.max_braking_mps2 * STEP_S
-        np.minimum(then[0], np.maximum(wanted_speed, floor), out=then[0])
-        speed, steer = _within(then, self._least, self._most)
+        speeds, steers = motion.speed_mps.tolist(), motion.steer_rad.tolist()
+        present = [math.tan(steer) / robot.wheelbase_m for steer in steers]
+        goals = [_finite(x, y) for x, y in waypoint_m.tolist()]
+        distance = [math.hypot(x, y) for x, y in goals]
+        widest = robot.max_curvature_per_m
+        toward = [_curvature_to(x, y, widest) for x, y in goals]
+        lifted = lift_points(scan_m, goals, robot)
+        choices = self._manoeuvres.choose(toward, present, distance, lifted)
+        allowed = [
+            0.0 if self._reached(x, ahead) else self._allowed_mps(ahead, choice)
+            for (x, _), ahead, choice in zip(goals, distance, choices, strict=True)
+        ]
+        nearest = self._nearest(lifted)
+        each = zip(speeds, steers, present, choices, allowed, nearest, strict=True)
+        speed, steer = np.array([self._resolve(*one) for one in each]).T
         return Motion(speed, steer)
 
-    def _choose_arc(
-        self,
-        present: NDArray[np.float64],
-        waypoint: NDArray[np.float64],
-        lifted: NDArray[np.float32],
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Curvature (B,) to steer and the speed (B,) it allows; `present` (B,) is being steered."""
-        gains, robot = self.gains, self.robot
-        distance = np.hypot(waypoint[:, 0], waypoint[:, 1])
-        toward = _curvature_to(waypoint, distance, robot.max_curvature_per_m)
-        choice = self._manoeuvres.choose(toward, present, distance, lifted)
-        slipped = (waypoint[:, 0] <= 0.0) & (distance < gains.slipped_m)
-        reached = slipped | (distance < gains.arrived_m)
-        speed = gains.waypoint_speed_per_s * distance * ~reached
-        speed = np.minimum(speed, np.sqrt(2.0 * gains.braking_mps2 * choice.free_m))
-        tight = gains.tight_speed_mps
-        faster_per_m = (robot.max_speed_mps - tight) / gains.open_clearance_m
-        clearance = np.maximum(choice.clearance_m, 0.0)
-        speed = np.minimum(speed, tight + faster_per_m * clearance)
-        return choice.curvature_per_m, np.minimum(speed, robot.max_speed_mps)
+    def _reached(self, x_m: float, distance_m: float) -> bool:
+        """Whether there is nothing left to drive to a waypoint `x_m` ahead, `distance_m` away."""
+        gains = self.gains
+        return distance_m < gains.arrived_m or (x_m <= 0.0 and distance_m < gains.slipped_m)
+
+    def _allowed_mps(self, distance_m: float, choice: Choice) -> float:
+        """Speed that a waypoint's distance and a manoeuvre allow."""
+        gains, fastest, tight = self.gains, self.robot.max_speed_mps, self.gains.tight_speed_mps
+        faster_per_m = (fastest - tight) / gains.open_clearance_m
+        return min(
+            gains.waypoint_speed_per_s * distance_m,
+            math.sqrt(2.0 * gains.braking_mps2 * choice.free_m),
+            tight + faster_per_m * max(choice.clearance_m, 0.0),
+            fastest,
+        )
+
+    def _nearest(self, lifted: NDArray[np.float32]) -> list[list[tuple[float, float]]]:
+        """Place of the return nearest to each repelled point of each of B robots, in m."""
+        batch, count = lifted.shape[:2]
+        squares = self._lifted @ lifted[:, :-1].swapaxes(1, 2)  # (B, 9, P)
+        row = squares.argmin(axis=2) + np.arange(0, batch * count, count)[:, None]  # (B, 9)
+        points = -0.5 * lifted[..., :2].reshape(-1, 2).take(row, axis=0)
+        return cast(list[list[tuple[float, float]]], points.tolist())
 
     def _resolve(
         self,
-        motion: Motion,
-        present: NDArray[np.float64],
-        curvature: NDArray[np.float64],
-        wanted_speed: NDArray[np.float64],
-        points: NDArray[np.float32],
-        lifted: NDArray[np.float32],
-    ) -> NDArray[np.float64]:
-        """Acceleration m/s2 and steering rate rad/s (2, B) that serve all policies best."""
-        gains, wheelbase = self.gains, self.robot.wheelbase_m
-        speed, steer = motion.speed_mps, motion.steer_rad
-        turning = np.maximum(speed, _LEAST_STEERING_SPEED_MPS)
-        gain = turning / (wheelbase * np.cos(steer) ** 2)
-        # A point at (x, y) moves with speed * (1 - c y, c x); its Jacobian's columns are
-        # (1 - c y, c x) for speed and gain * (-y, x) for steering. A row for each policy: what
-        # these are along its direction, and the acceleration it wishes there.
-        rows = np.empty((len(points), 3, len(self._metric)))
-        metric = np.empty((len(points), len(self._metric)))
-        metric[:] = self._metric
+        speed: float,
+        steer: float,
+        present: float,
+        choice: Choice,
+        allowed_mps: float,
+        nearest: list[tuple[float, float]],
+    ) -> tuple[float, float]:
+        """Speed m/s and steering angle rad, 0.1 s on, that serve all policies of one robot best.
 
-        repelled = self._points[_ATTRACTED:]  # (9, 2)
-        nearest = (lifted[:, 1:] @ self._repelled).argmin(axis=1)  # (B, 9)
-        away = repelled - points[np.arange(len(points))[:, None], nearest]  # (B, 9, 2)
-        gap_m = np.maximum(np.hypot(away[..., 0], away[..., 1]), 1e-3)
-        away = away / gap_m[..., None]
-        x, y = repelled[:, 0], repelled[:, 1]
-        across = away[..., 1] * x - away[..., 0] * y  # (B, 9)
-        by_speed, by_steer = away[..., 0] + present[:, None] * across, gain[:, None] * across
-        approach = np.minimum(speed[:, None] * by_speed, 0.0)
-        rows[:, 0, 2:], rows[:, 1, 2:] = by_speed, by_steer
-        rows[:, 2, 2:] = gains.repulsion_mps2 - gains.repulsion_damping_per_s * approach
-        metric[:, 2:] *= np.exp(-gains.repulsion_decay_per_m * gap_m)
-
+        A point at (x, y) moves with speed * (1 - c y, c x), so it is accelerated by (1 - c y, c x)
+        for each unit of acceleration and by (-y, x) for each of bending, the speed times the
+        change of curvature c.
+        """
+        gains, robot = self.gains, self.robot
+        turning = max(speed, _LEAST_STEERING_SPEED_MPS)
         # The attracted points lie symmetric to the axis: summed, they are one at base_link and
         # one abreast, which wish for the velocities they would have on the wanted arc.
-        faster = gains.attraction_per_s * (wanted_speed - speed)
-        sharper = gains.attraction_per_s * (curvature - present) * turning
-        rows[:, 0, 0], rows[:, 1, 0], rows[:, 2, 0] = 1.0, 0.0, faster
-        rows[:, 0, 1], rows[:, 1, 1], rows[:, 2, 1] = present, gain, present * faster + sharper
-
+        faster = gains.attraction_per_s * (allowed_mps - speed)
+        sharper = gains.attraction_per_s * (choice.curvature_per_m - present) * turning
+        abreast = present * faster + sharper
+        m11 = self._ahead + self._abreast * present * present
+        m12 = self._abreast * present
+        m22 = self._abreast
+        r1 = self._ahead * faster + m12 * abreast
+        r2 = self._abreast * abreast
+        # The others wish to get away from the return nearest to each.
+        for (x, y, most), (near_x, near_y) in zip(self._repelled, nearest, strict=True):
+            gap_m = max(math.hypot(x - near_x, y - near_y), 1e-3)
+            away_x, away_y = (x - near_x) / gap_m, (y - near_y) / gap_m
+            across = away_y * x - away_x * y
+            along = away_x + present * across
+            approach = min(speed * along, 0.0)
+            wish = gains.repulsion_mps2 - gains.repulsion_damping_per_s * approach
+            metric = most * math.exp(-gains.repulsion_decay_per_m * gap_m)
+            m11 += metric * along * along
+            m12 += metric * along * across
+            m22 += metric * across * across
+            r1 += metric * along * wish
+            r2 += metric * across * wish
         # Pseudo-inverse of the 2 x 2 normal equations; the attracted points keep it regular.
-        sums = (rows * metric[:, None]) @ rows.swapaxes(1, 2)  # (B, 3, 3)
-        m11, m12, m22 = sums[:, 0, 0], sums[:, 0, 1], sums[:, 1, 1]
-        r1, r2 = sums[:, 0, 2], sums[:, 1, 2]
         determinant = m11 * m22 - m12 * m12
-        return np.array([m22 * r1 - m12 * r2, m11 * r2 - m12 * r1]) / determinant
+        acceleration = (m22 * r1 - m12 * r2) / determinant
+        bending = (m11 * r2 - m12 * r1) / determinant  # speed times change of curvature
+        steer_rate = bending * robot.wheelbase_m * math.cos(steer) ** 2 / turning
+
+        braking, accelerating = robot.max_braking_mps2, robot.max_acceleration_mps2
+        then_mps = speed + _clip(acceleration, -braking, accelerating) * STEP_S
+        # What braking can do is never traded against what attraction would like.
+        then_mps = min(then_mps, max(allowed_mps, speed - braking * STEP_S))
+        quickest, lock = robot.max_steer_rate_rad_s, robot.max_steer_rad
+        then_rad = steer + _clip(steer_rate, -quickest, quickest) * STEP_S
+        return _clip(then_mps, 0.0, robot.max_speed_mps), _clip(then_rad, -lock, lock)
 
 
-def _within(
-    value: NDArray[np.float64],
-    low: NDArray[np.float64] | float,
-    high: NDArray[np.float64] | float,
-) -> NDArray[np.float64]:
-    """Clip; np.clip costs five times as much on a single robot's arrays."""
-    return np.asarray(np.minimum(np.maximum(value, low), high))
+def _clip(value: float, low: float, high: float) -> float:
+    return min(max(value, low), high)
 
 
-def _curvature_to(
-    waypoint: NDArray[np.float64], distance: NDArray[np.float64], widest: float
-) -> NDArray[np.float64]:
-    """Curvature (B,) of the arc from base_link through each waypoint, clipped to full lock."""
-    x, y = waypoint[:, 0], waypoint[:, 1]
-    curvature = 2.0 * y / np.maximum(distance, 0.05) ** 2
-    # What lies behind needs a full turn to its side.
-    curvature = np.where(x < 0.0, np.copysign(widest, y), curvature)
-    return _within(curvature, -widest, widest)
+def _finite(x: float, y: float) -> tuple[float, float]:
+    """The place itself, or where the robot is if it is not finite."""
+    return (x, y) if math.isfinite(x) and math.isfinite(y) else (0.0, 0.0)
+
+
+def _curvature_to(x: float, y: float, widest: float) -> float:
+    """Curvature of the arc from base_link through a place, clipped to full lock."""
+    if x < 0.0:  # what lies behind needs a full turn to its side
+        return math.copysign(widest, y)
+    return _clip(2.0 * y / max(x * x + y * y, 0.0025), -widest, widest)

@@ -4,7 +4,10 @@ Repulsion alone, and a single arc too, drive into dead ends beside an obstacle; 
 shows early enough whether the car, which cannot reverse, will get out again behind it.
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +21,7 @@ SPACING_M = 0.12  # between the checked places of a manoeuvre
 FIRST_SAMPLES, SECOND_SAMPLES = 3, 7
 SAMPLES = FIRST_SAMPLES + SECOND_SAMPLES
 _OPEN_M = 10.0  # clearance and free length where nothing is near
+_MOST_LACK = 1.5  # in parts of the wanted clearance
 _REAR_POINTS = 4  # on each side, of 48: 100 deg and more from ahead, forward drives only leave them
 _DIRECT_ARCS = 257  # to the waypoint; the nearest one is less than 7 mm off at its end
 
@@ -39,13 +43,12 @@ class ManoeuvreGains:
     change_weight: float = 0.15  # first arc's change from the present curvature
 
 
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """Chosen manoeuvres of B robots: first curvature, least clearance, free length (B,)."""
+class Choice(NamedTuple):
+    """The manoeuvre chosen for one robot: its first curvature, least clearance, free length."""
 
-    curvature_per_m: NDArray[np.float64]
-    clearance_m: Floats
-    free_m: Floats
+    curvature_per_m: float
+    clearance_m: float
+    free_m: float
 
 
 class Manoeuvres:
@@ -57,7 +60,8 @@ class Manoeuvres:
         widest = robot.max_curvature_per_m
         first = np.linspace(-widest, widest, gains.first_arcs)
         second = np.linspace(-widest, widest, gains.second_arcs)
-        self._first = np.repeat(first, gains.second_arcs)  # (T,)
+        # (T + 1,): the arc to the waypoint comes last and has its own curvature.
+        self._first = np.append(np.repeat(first, gains.second_arcs), 0.0).astype(np.float32)
         lead_x, lead_y = _arc(first, FIRST_SAMPLES)  # (F, 3)
         tail_x, tail_y = _arc(second, SECOND_SAMPLES)  # (G, 7)
         turned = (first * SPACING_M * FIRST_SAMPLES)[:, None, None]
@@ -68,74 +72,100 @@ class Manoeuvres:
         arcs = np.linspace(-widest, widest, _DIRECT_ARCS)
         self._direct = lift_places(*_arc(arcs, SAMPLES)).swapaxes(0, 1).copy()  # (A, 4, 10)
         self._arcs_per_curvature = 0.5 * (_DIRECT_ARCS - 1) / widest
-        manoeuvre = np.arange(len(self._first))
+        manoeuvre = np.arange(len(self._first) - 1)
         begin = manoeuvre[:, None] // gains.second_arcs * FIRST_SAMPLES + np.arange(FIRST_SAMPLES)
         end = lead_x.size + manoeuvre[:, None] * SECOND_SAMPLES + np.arange(SECOND_SAMPLES)
-        direct = self._tree.shape[1] + np.arange(SAMPLES)  # the arc to the waypoint comes last
+        direct = self._tree.shape[1] + np.arange(SAMPLES)
         rows = np.concatenate([np.concatenate([begin, end], axis=1), direct[None]])
         self._samples = np.ascontiguousarray(rows.T)  # (10, T + 1) places of each manoeuvre
-        self._minded_m = (SPACING_M * (np.arange(SAMPLES) + 0.5)).astype(np.float32)
-        self._hit_m2 = np.float32((robot.body_radius_m + gains.least_clearance_m) ** 2)
-        # Free length where the first sample to hit is 0 to 9, or none.
-        self._free_m = np.append(SPACING_M * np.arange(SAMPLES), _OPEN_M)
-        # Of the change from the waypoint's curvature, that from the present one, the nearest
-        # distance to the waypoint, the squared lack of clearance, the blocked part of the way.
+        # Added to the squared distances at samples of which the first 0 to 10 are minded.
+        unminded = np.arange(SAMPLES) >= np.arange(SAMPLES + 1)[:, None]
+        self._unminded_m2 = (_OPEN_M**2 * unminded[..., None]).astype(np.float32)  # (11, 10, 1)
+        self._hit_m2 = (robot.body_radius_m + gains.least_clearance_m) ** 2
+        self._free_m = (SPACING_M * np.arange(SAMPLES)[:, None]).astype(np.float32)  # before each
+        # Part of the wanted clearance that a distance to the nearest return lacks, at most 1.5.
+        self._lack_at_0 = 1.0 + robot.body_radius_m / gains.wanted_clearance_m
+        self._lack_per_m = 1.0 / gains.wanted_clearance_m
+        least_m = max((self._lack_at_0 - _MOST_LACK) / self._lack_per_m, 0.0)
+        self._least_m2 = np.array([[least_m**2], [0.0]], np.float32)  # to return, to waypoint
+        # Of the change from the waypoint's curvature, that from the present one, the squared lack
+        # of clearance, the nearest distance to the waypoint, the blocked part of the way.
         self._weights = np.array(
             [
                 gains.toward_weight / widest,
                 gains.change_weight / widest,
-                gains.miss_weight_per_m,
                 gains.clearance_weight,
+                gains.miss_weight_per_m,
                 gains.blocked_weight,
-            ]
+            ],
+            np.float32,
         )
 
     def choose(
         self,
-        toward_per_m: NDArray[np.float64],
-        present_per_m: NDArray[np.float64],
-        distance_m: NDArray[np.float64],
+        toward_per_m: Sequence[float],
+        present_per_m: Sequence[float],
+        distance_m: Sequence[float],
         lifted: NDArray[np.float32],
-    ) -> Choice:
+    ) -> list[Choice]:
         """Cheapest manoeuvre of each of B robots.
 
         `toward_per_m` (B,) leads to the waypoint, `distance_m` (B,) away, `present_per_m` (B,) is
-        being steered, `lifted` (B, 1 + P, 4) are waypoint and scan as of `lift_points`.
+        being steered, `lifted` (B, P + 1, 4) are scan and waypoint as of `lift_points`.
         """
-        gains = self._gains
         batch, tree = len(lifted), self._tree.shape[1]
+        middle = _DIRECT_ARCS // 2
+        arcs = [middle + round(toward * self._arcs_per_curvature) for toward in toward_per_m]
+        horizons_m = [self._horizon_m(distance) for distance in distance_m]
+        minded = [int(horizon / SPACING_M + 0.5) for horizon in horizons_m]
+
         places = np.empty((batch, 4, tree + SAMPLES), np.float32)
-        places[:, :, :tree] = self._tree
-        arc = np.rint(toward_per_m * self._arcs_per_curvature).astype(np.intp)
-        places[:, :, tree:] = self._direct.take(arc + _DIRECT_ARCS // 2, axis=0)
-        square = lifted @ places  # (B, 1 + P, N)
+        places[:, :, :tree], places[:, :, tree:] = self._tree, self._direct.take(arcs, axis=0)
+        square = lifted @ places  # (B, P + 1, N) m2
+        nearest = np.empty((batch, 2, tree + SAMPLES), np.float32)  # return, waypoint
+        square[:, _REAR_POINTS : -1 - _REAR_POINTS].min(axis=1, out=nearest[:, 0])
+        nearest[:, 1] = square[:, -1]
+        samples = nearest.take(self._samples, axis=2)  # (B, 2, 10, T + 1)
+        returns = samples[:, 0]
+        returns += self._unminded_m2.take(minded, axis=0)
+        hit = returns < self._hit_m2
 
-        # A waypoint nearer than usual is the goal: nothing behind it matters.
-        beyond = gains.beyond_per_m * np.maximum(distance_m - gains.near_waypoint_m, 0.0)
-        horizon = np.minimum(distance_m + beyond, SPACING_M * SAMPLES)[:, None]
-        ahead = square[:, 1 + _REAR_POINTS : -_REAR_POINTS]
-        sample = ahead.min(axis=1).take(self._samples, axis=1)  # (B, 10, T + 1) m2
-        sample += ((self._minded_m > horizon) * np.float32(_OPEN_M**2))[..., None]
-        hit = np.empty((batch, SAMPLES + 1, sample.shape[2]), np.bool_)
-        hit[:, :-1], hit[:, -1] = sample < self._hit_m2, True
-        hit_at = hit.argmax(axis=1)  # (B, T + 1)
-        clearance = np.sqrt(np.maximum(sample.min(axis=1), 0.0)) - self._robot.body_radius_m
-        short = np.minimum(np.maximum(1.0 - clearance / gains.wanted_clearance_m, 0.0), 1.5)
-        miss = square[:, 0].take(self._samples, axis=1).min(axis=1)
+        steered = np.array([toward_per_m, present_per_m], np.float32).T[..., None]  # (B, 2, 1)
+        terms = np.empty((batch, 5, len(self._first)), np.float32)
+        turned, distances, lack, blocked = terms[:, :2], terms[:, 2:4], terms[:, 2], terms[:, 4]
+        np.subtract(self._first, steered, out=turned)
+        turned[..., -1] = [
+            (0.0, toward - present)
+            for toward, present in zip(toward_per_m, present_per_m, strict=True)
+        ]
+        np.abs(turned, out=turned)
+        np.sqrt(np.maximum(samples.min(axis=2), self._least_m2), out=distances)
+        np.maximum(self._lack_at_0 - self._lack_per_m * lack, 0.0, out=lack)
+        lack *= lack
+        way_m = np.array([max(horizon, SPACING_M) for horizon in horizons_m], np.float32)
+        behind = 1.0 - self._free_m / way_m[:, None, None]  # part of the way behind each sample
+        (hit * behind).max(axis=1, out=blocked)
+        best = (self._weights @ terms).argmin(axis=1).tolist()
+        return [
+            self._choice(
+                toward_per_m[row] if at == len(self._first) - 1 else float(self._first[at]),
+                returns[row, :, at].tolist(),
+            )
+            for row, at in enumerate(best)
+        ]
 
-        first = np.empty(clearance.shape)
-        first[:, :-1], first[:, -1] = self._first, toward_per_m
-        terms = np.empty((batch, 5, first.shape[1]))
-        terms[:, 0] = np.abs(first - toward_per_m[:, None])
-        terms[:, 1] = np.abs(first - present_per_m[:, None])
-        terms[:, 2] = np.sqrt(np.maximum(miss, 0.0))
-        terms[:, 3] = short * short
-        terms[:, 4] = 1.0 - np.minimum(
-            self._free_m.take(hit_at) / np.maximum(horizon, SPACING_M), 1.0
-        )
-        best = (self._weights @ terms).argmin(axis=1) + np.arange(batch) * first.shape[1]
-        free_m = self._free_m.take(hit_at.take(best))
-        return Choice(first.take(best), clearance.take(best), free_m)
+    def _horizon_m(self, distance_m: float) -> float:
+        """Length of way that counts; a waypoint nearer than usual is the goal, no more does."""
+        gains = self._gains
+        beyond = gains.beyond_per_m * max(distance_m - gains.near_waypoint_m, 0.0)
+        return min(distance_m + beyond, SPACING_M * SAMPLES)
+
+    def _choice(self, curvature_per_m: float, returns_m2: list[float]) -> Choice:
+        """What the squared distances from a manoeuvre's samples (10,) to the returns allow."""
+        least_m2 = max(min(returns_m2), 0.0)
+        free = next((i for i, m2 in enumerate(returns_m2) if m2 < self._hit_m2), None)
+        clearance_m = math.sqrt(least_m2) - self._robot.body_radius_m
+        return Choice(curvature_per_m, clearance_m, _OPEN_M if free is None else SPACING_M * free)
 
 
 def _arc(
