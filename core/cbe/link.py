@@ -177,7 +177,8 @@ class Link:
         payload = msgspec.json.encode(request or {})
         deadline = time.monotonic() + timeout_s
         while True:
-            left_s = max(deadline - time.monotonic(), 0.05)
+            # Never so short that a busy link could not even say that nobody is there.
+            left_s = max(deadline - time.monotonic(), 0.2)
             replies = self._guarded(self._session.get, key, payload=payload, timeout=left_s)
             for reply in replies:
                 if reply.ok is not None:
