@@ -31,12 +31,13 @@ class ManoeuvreGains:
     """What a manoeuvre may cost; curvatures count in parts of full lock."""
 
     first_arcs: int = 11
-    second_arcs: int = 7
+    second_arcs: int = 5
     near_waypoint_m: float = 0.35  # from here on, way beyond the waypoint counts
     beyond_per_m: float = 3.0  # so much, per metre
     wanted_clearance_m: float = 0.2  # between body and obstacle
     least_clearance_m: float = 0.03
     miss_weight_per_m: float = 1.0  # nearest distance to the waypoint
+    away_weight_per_m: float = 1.5  # how much farther from the waypoint it ends than it begins
     clearance_weight: float = 2.0
     blocked_weight: float = 4.0
     toward_weight: float = 0.3  # first arc's change from the waypoint's curvature
@@ -87,15 +88,18 @@ class Manoeuvres:
         self._lack_at_0 = 1.0 + robot.body_radius_m / gains.wanted_clearance_m
         self._lack_per_m = 1.0 / gains.wanted_clearance_m
         least_m = max((self._lack_at_0 - _MOST_LACK) / self._lack_per_m, 0.0)
-        self._least_m2 = np.array([[least_m**2], [0.0]], np.float32)  # to return, to waypoint
+        # To the nearest return, and to the waypoint at the nearest sample and at the last.
+        self._least_m2 = np.array([[least_m**2], [0.0], [0.0]], np.float32)
         # Of the change from the waypoint's curvature, that from the present one, the squared lack
-        # of clearance, the nearest distance to the waypoint, the blocked part of the way.
+        # of clearance, the nearest distance to the waypoint, the distance it is left behind by at
+        # the end, the blocked part of the way.
         self._weights = np.array(
             [
                 gains.toward_weight / widest,
                 gains.change_weight / widest,
                 gains.clearance_weight,
                 gains.miss_weight_per_m,
+                gains.away_weight_per_m,
                 gains.blocked_weight,
             ],
             np.float32,
@@ -131,15 +135,24 @@ class Manoeuvres:
         hit = returns < self._hit_m2
 
         steered = np.array([toward_per_m, present_per_m], np.float32).T[..., None]  # (B, 2, 1)
-        terms = np.empty((batch, 5, len(self._first)), np.float32)
-        turned, distances, lack, blocked = terms[:, :2], terms[:, 2:4], terms[:, 2], terms[:, 4]
+        terms = np.empty((batch, 6, len(self._first)), np.float32)
+        turned, distances, blocked = terms[:, :2], terms[:, 2:5], terms[:, 5]
+        lack, away = terms[:, 2], terms[:, 4]
         np.subtract(self._first, steered, out=turned)
         turned[..., -1] = [
             (0.0, toward - present)
             for toward, present in zip(toward_per_m, present_per_m, strict=True)
         ]
         np.abs(turned, out=turned)
-        np.sqrt(np.maximum(samples.min(axis=2), self._least_m2), out=distances)
+        samples.min(axis=2, out=distances[:, :2])
+        away[:] = samples[:, 1, -1]
+        np.sqrt(np.maximum(distances, self._least_m2), out=distances)
+        # At the goal all manoeuvres lead away.
+        here_m = [
+            [distance if count == SAMPLES else math.inf]
+            for distance, count in zip(distance_m, minded, strict=True)
+        ]
+        np.maximum(away - np.array(here_m, np.float32), 0.0, out=away)
         np.maximum(self._lack_at_0 - self._lack_per_m * lack, 0.0, out=lack)
         lack *= lack
         way_m = np.array([max(horizon, SPACING_M) for horizon in horizons_m], np.float32)
