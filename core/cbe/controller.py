@@ -54,6 +54,8 @@ class RmpGains:
     braking_mps2: float = 1.0  # comfortable, half of what the robot can do
     tight_speed_mps: float = 0.2  # at no clearance, rising to full speed at
     open_clearance_m: float = 0.1
+    creep_mps: float = 0.1  # where a manoeuvre is tighter than wished for but touches nothing
+    creep_clearance_m: float = 0.015
 
 
 def twist(motion: Motion, robot: Robot) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -133,9 +135,10 @@ class RmpController:
         """Speed that a waypoint's distance and a manoeuvre allow."""
         gains, fastest, tight = self.gains, self.robot.max_speed_mps, self.gains.tight_speed_mps
         faster_per_m = (fastest - tight) / gains.open_clearance_m
+        creep = gains.creep_mps if choice.clearance_m > gains.creep_clearance_m else 0.0
         return min(
             gains.waypoint_speed_per_s * distance_m,
-            math.sqrt(2.0 * gains.braking_mps2 * choice.free_m),
+            max(math.sqrt(2.0 * gains.braking_mps2 * choice.free_m), creep),
             tight + faster_per_m * max(choice.clearance_m, 0.0),
             fastest,
         )

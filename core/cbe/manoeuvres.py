@@ -37,7 +37,7 @@ class ManoeuvreGains:
     wanted_clearance_m: float = 0.2  # between body and obstacle
     least_clearance_m: float = 0.03
     miss_weight_per_m: float = 1.0  # nearest distance to the waypoint
-    away_weight_per_m: float = 1.5  # how much farther from the waypoint it ends than it begins
+    away_weight_per_m: float = 1.5  # how much farther it ends than straight past the waypoint
     clearance_weight: float = 2.0
     blocked_weight: float = 4.0
     toward_weight: float = 0.3  # first arc's change from the waypoint's curvature
@@ -91,8 +91,8 @@ class Manoeuvres:
         # To the nearest return, and to the waypoint at the nearest sample and at the last.
         self._least_m2 = np.array([[least_m**2], [0.0], [0.0]], np.float32)
         # Of the change from the waypoint's curvature, that from the present one, the squared lack
-        # of clearance, the nearest distance to the waypoint, the distance it is left behind by at
-        # the end, the blocked part of the way.
+        # of clearance, the least distance to the waypoint, how far it ends away from there, the
+        # blocked part of the way.
         self._weights = np.array(
             [
                 gains.toward_weight / widest,
@@ -147,12 +147,9 @@ class Manoeuvres:
         samples.min(axis=2, out=distances[:, :2])
         away[:] = samples[:, 1, -1]
         np.sqrt(np.maximum(distances, self._least_m2), out=distances)
-        # At the goal all manoeuvres lead away.
-        here_m = [
-            [distance if count == SAMPLES else math.inf]
-            for distance, count in zip(distance_m, minded, strict=True)
-        ]
-        np.maximum(away - np.array(here_m, np.float32), 0.0, out=away)
+        # Straight past the waypoint is not away from it.
+        past_m = [[max(distance, SPACING_M * SAMPLES - distance)] for distance in distance_m]
+        np.maximum(away - np.array(past_m, np.float32), 0.0, out=away)
         np.maximum(self._lack_at_0 - self._lack_per_m * lack, 0.0, out=lack)
         lack *= lack
         way_m = np.array([max(horizon, SPACING_M) for horizon in horizons_m], np.float32)

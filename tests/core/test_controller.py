@@ -25,8 +25,9 @@ def scan_of_disc(x, y, radius, pose=(0.0, 0.0, 0.0)):
     return np.where(hit, along - half, np.inf)[None].astype(np.float32)
 
 
-def drive(path, disc=None, steps=100):
+def drive(path, *discs, steps=100):
     """Trace (T, 5) x, y, yaw, speed, steering of an ideal car led along x = 0.55 m ahead."""
+    free = np.full((1, 240), np.inf, np.float32)
     pose, motion = np.zeros(3), Motion(np.zeros(1), np.zeros(1))
     trace = []
     for _ in range(steps):
@@ -35,7 +36,7 @@ def drive(path, disc=None, steps=100):
         cos, sin = np.cos(pose[2]), np.sin(pose[2])
         d = target - pose[:2]
         waypoint = np.array([[cos * d[0] + sin * d[1], cos * d[1] - sin * d[0]]])
-        scan = np.full((1, 240), np.inf, np.float32) if disc is None else scan_of_disc(*disc, pose)
+        scan = np.minimum.reduce([free, *(scan_of_disc(*disc, pose) for disc in discs)])
         motion = CONTROLLER.step(motion, waypoint, scan)
         speed, yaw_rate = twist(motion, ROBOT)
         for _ in range(10):
@@ -86,14 +87,22 @@ def test_circle_above_the_turning_radius_is_followed():
 
 @pytest.mark.parametrize("offset_m", [0.0, 0.075, -0.15, 0.225])
 def test_bin_on_or_beside_the_path_is_passed_without_contact(offset_m):
-    trace = drive(straight(4.0), disc=(2.0, offset_m, 0.15), steps=130)
+    trace = drive(straight(4.0), (2.0, offset_m, 0.15), steps=130)
     clearance = np.hypot(trace[:, 0] - 2.0, trace[:, 1] - offset_m) - 0.15 - ROBOT.body_radius_m
     assert clearance.min() > 0.04
     assert np.hypot(*(trace[-1, :2] - [4.0, 0.0])) < 0.1
 
 
+@pytest.mark.parametrize(("gap_m", "creeps"), [(0.28, True), (0.25, False)])
+def test_gap_barely_wider_than_the_robot_is_crept_into(gap_m, creeps):
+    apart, before = 0.5 * gap_m + 0.3, (1.38, 0.0, 0.0)
+    scan = np.minimum(scan_of_disc(1.5, apart, 0.3, before), scan_of_disc(1.5, -apart, 0.3, before))
+    motion = CONTROLLER.step(Motion(np.zeros(1), np.zeros(1)), np.array([[0.55, 0.0]]), scan)
+    assert (0.05 < motion.speed_mps[0] <= 0.1) if creeps else motion.speed_mps[0] == 0.0
+
+
 def test_wall_across_the_way_stops_the_robot():
-    trace = drive(straight(4.0), disc=(4.0, 0.0, 2.0), steps=120)
+    trace = drive(straight(4.0), (4.0, 0.0, 2.0), steps=120)
     assert np.hypot(trace[:, 0] - 4.0, trace[:, 1]).min() > 2.0 + ROBOT.body_radius_m
 
 
