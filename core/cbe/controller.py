@@ -12,6 +12,7 @@ that arc is not blindly the one to the waypoint but the first of the manoeuvre t
 
 import math
 from dataclasses import dataclass, field
+from math import exp, hypot
 from typing import cast
 
 import numpy as np
@@ -90,7 +91,7 @@ class RmpController:
         # Nine points round the front half are repelled: x, y and the metric at no distance.
         angle = np.radians([0.0, 45.0, -45.0, 22.5, -22.5, 67.5, -67.5, 90.0, -90.0])
         x, y = radius * np.cos(angle), radius * np.sin(angle)
-        metric = math.exp(gains.repulsion_decay_per_m * gains.repulsion_reach_m)
+        metric = exp(gains.repulsion_decay_per_m * gains.repulsion_reach_m)
         metric *= gains.repulsion_metric
         most = metric * np.array([gains.nose_weight, *[gains.corner_weight] * 2, *[1.0] * 6])
         self._repelled = list(zip(x.tolist(), y.tolist(), most.tolist(), strict=True))
@@ -112,7 +113,7 @@ class RmpController:
         speeds, steers = motion.speed_mps.tolist(), motion.steer_rad.tolist()
         present = [math.tan(steer) / robot.wheelbase_m for steer in steers]
         goals = [_finite(x, y) for x, y in waypoint_m.tolist()]
-        distance = [math.hypot(x, y) for x, y in goals]
+        distance = [hypot(x, y) for x, y in goals]
         widest = robot.max_curvature_per_m
         toward = [_curvature_to(x, y, widest) for x, y in goals]
         lifted = lift_points(scan_m, goals, robot)
@@ -179,19 +180,23 @@ class RmpController:
         r1 = self._ahead * faster + m12 * abreast
         r2 = self._abreast * abreast
         # The others wish to get away from the return nearest to each.
+        wish_at_rest, decay_per_m = gains.repulsion_mps2, gains.repulsion_decay_per_m
+        damping_per_s = gains.repulsion_damping_per_s
         for (x, y, most), (near_x, near_y) in zip(self._repelled, nearest, strict=True):
-            gap_m = max(math.hypot(x - near_x, y - near_y), 1e-3)
-            away_x, away_y = (x - near_x) / gap_m, (y - near_y) / gap_m
-            across = away_y * x - away_x * y
-            along = away_x + present * across
-            approach = min(speed * along, 0.0)
-            wish = gains.repulsion_mps2 - gains.repulsion_damping_per_s * approach
-            metric = most * math.exp(-gains.repulsion_decay_per_m * gap_m)
-            m11 += metric * along * along
-            m12 += metric * along * across
-            m22 += metric * across * across
-            r1 += metric * along * wish
-            r2 += metric * across * wish
+            away_x, away_y = x - near_x, y - near_y
+            gap_m = hypot(away_x, away_y) + 1e-9
+            across = (away_y * x - away_x * y) / gap_m
+            along = away_x / gap_m + present * across
+            approach = speed * along
+            wish = wish_at_rest if approach > 0.0 else wish_at_rest - damping_per_s * approach
+            metric = most * exp(-decay_per_m * gap_m)
+            weighted = metric * along
+            m11 += weighted * along
+            m12 += weighted * across
+            r1 += weighted * wish
+            weighted = metric * across
+            m22 += weighted * across
+            r2 += weighted * wish
         # Pseudo-inverse of the 2 x 2 normal equations; the attracted points keep it regular.
         determinant = m11 * m22 - m12 * m12
         acceleration = (m22 * r1 - m12 * r2) / determinant

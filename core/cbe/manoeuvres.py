@@ -127,7 +127,8 @@ class Manoeuvres:
         places[:, :, :tree], places[:, :, tree:] = self._tree, self._direct.take(arcs, axis=0)
         square = lifted @ places  # (B, P + 1, N) m2
         nearest = np.empty((batch, 2, tree + SAMPLES), np.float32)  # return, waypoint
-        square[:, _REAR_POINTS : -1 - _REAR_POINTS].min(axis=1, out=nearest[:, 0])
+        ahead = square[:, _REAR_POINTS : -1 - _REAR_POINTS]
+        np.minimum.reduce(ahead, axis=1, out=nearest[:, 0])
         nearest[:, 1] = square[:, -1]
         samples = nearest.take(self._samples, axis=2)  # (B, 2, 10, T + 1)
         returns = samples[:, 0]
@@ -144,7 +145,7 @@ class Manoeuvres:
             for toward, present in zip(toward_per_m, present_per_m, strict=True)
         ]
         np.abs(turned, out=turned)
-        samples.min(axis=2, out=distances[:, :2])
+        np.minimum.reduce(samples, axis=2, out=distances[:, :2])
         away[:] = samples[:, 1, -1]
         np.sqrt(np.maximum(distances, self._least_m2), out=distances)
         # Straight past the waypoint is not away from it.
@@ -154,7 +155,7 @@ class Manoeuvres:
         lack *= lack
         way_m = np.array([max(horizon, SPACING_M) for horizon in horizons_m], np.float32)
         behind = 1.0 - self._free_m / way_m[:, None, None]  # part of the way behind each sample
-        (hit * behind).max(axis=1, out=blocked)
+        np.maximum.reduce(hit * behind, axis=1, out=blocked)
         best = (self._weights @ terms).argmin(axis=1).tolist()
         return [
             self._choice(
@@ -172,10 +173,11 @@ class Manoeuvres:
 
     def _choice(self, curvature_per_m: float, returns_m2: list[float]) -> Choice:
         """What the squared distances from a manoeuvre's samples (10,) to the returns allow."""
-        least_m2 = max(min(returns_m2), 0.0)
-        free = next((i for i, m2 in enumerate(returns_m2) if m2 < self._hit_m2), None)
-        clearance_m = math.sqrt(least_m2) - self._robot.body_radius_m
-        return Choice(curvature_per_m, clearance_m, _OPEN_M if free is None else SPACING_M * free)
+        least_m2, free_m = min(returns_m2), _OPEN_M
+        if least_m2 < self._hit_m2:
+            free_m = SPACING_M * next(i for i, m2 in enumerate(returns_m2) if m2 < self._hit_m2)
+        clearance_m = math.sqrt(max(least_m2, 0.0)) - self._robot.body_radius_m
+        return Choice(curvature_per_m, clearance_m, free_m)
 
 
 def _arc(
