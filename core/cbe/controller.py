@@ -10,9 +10,8 @@ that arc is not blindly the one to the waypoint but the first of the manoeuvre t
 (`cbe.manoeuvres`), which steers round what mere repulsion only brakes for.
 """
 
-import math
 from dataclasses import dataclass, field
-from math import exp, hypot
+from math import copysign, cos, exp, hypot, isfinite, sqrt, tan
 from typing import cast
 
 import numpy as np
@@ -111,7 +110,7 @@ class RmpController:
         """
         robot = self.robot
         speeds, steers = motion.speed_mps.tolist(), motion.steer_rad.tolist()
-        present = [math.tan(steer) / robot.wheelbase_m for steer in steers]
+        present = [tan(steer) / robot.wheelbase_m for steer in steers]
         goals = [_finite(x, y) for x, y in waypoint_m.tolist()]
         distance = [hypot(x, y) for x, y in goals]
         widest = robot.max_curvature_per_m
@@ -139,7 +138,7 @@ class RmpController:
         creep = gains.creep_mps if choice.clearance_m > gains.creep_clearance_m else 0.0
         return min(
             gains.waypoint_speed_per_s * distance_m,
-            max(math.sqrt(2.0 * gains.braking_mps2 * choice.free_m), creep),
+            max(sqrt(2.0 * gains.braking_mps2 * choice.free_m), creep),
             tight + faster_per_m * max(choice.clearance_m, 0.0),
             fastest,
         )
@@ -201,7 +200,7 @@ class RmpController:
         determinant = m11 * m22 - m12 * m12
         acceleration = (m22 * r1 - m12 * r2) / determinant
         bending = (m11 * r2 - m12 * r1) / determinant  # speed times change of curvature
-        steer_rate = bending * robot.wheelbase_m * math.cos(steer) ** 2 / turning
+        steer_rate = bending * robot.wheelbase_m * cos(steer) ** 2 / turning
 
         braking, accelerating = robot.max_braking_mps2, robot.max_acceleration_mps2
         then_mps = speed + _clip(acceleration, -braking, accelerating) * STEP_S
@@ -218,11 +217,11 @@ def _clip(value: float, low: float, high: float) -> float:
 
 def _finite(x: float, y: float) -> tuple[float, float]:
     """The place itself, or where the robot is if it is not finite."""
-    return (x, y) if math.isfinite(x) and math.isfinite(y) else (0.0, 0.0)
+    return (x, y) if isfinite(x) and isfinite(y) else (0.0, 0.0)
 
 
 def _curvature_to(x: float, y: float, widest: float) -> float:
     """Curvature of the arc from base_link through a place, clipped to full lock."""
     if x < 0.0:  # what lies behind needs a full turn to its side
-        return math.copysign(widest, y)
+        return copysign(widest, y)
     return _clip(2.0 * y / max(x * x + y * y, 0.0025), -widest, widest)
