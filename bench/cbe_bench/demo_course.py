@@ -10,10 +10,10 @@ import numpy as np
 from scipy import ndimage
 
 from cbe.errors import WorldError
-from cbe.geometry import wrap_angle
-from cbe_bench.scenario import JITTER_LIMIT_M, JITTER_M, JITTER_RAD
+from cbe_bench.jitter import jittered
 from cbe_hil_sim.astar import SPACING_M, GoalField, plan
 from cbe_hil_sim.demonstrator import start_pose
+from cbe_hil_sim.worldbatch import WorldBatch
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,8 +26,6 @@ WAY_CLEARANCE_M = 0.24
 LINTEL_M = 1.8  # what spans free floor from above this up to the ceiling is a lintel
 DOOR_DISTANCE_POINTS = 16  # no drive begins or ends within 0.8 m of a door
 GOALS, STARTS = 40, 6
-
-START_CLEARANCE_M = 0.25
 
 BIN_M = 0.3
 BIN_HEIGHT_M = 1.0
@@ -119,25 +117,17 @@ def _cut(
     return best
 
 
-def jittered(world: World, pose: NDArray[np.floating], seed: int) -> NDArray[np.float64]:
-    """A pose (3,) near `pose` (3,) as the paper jitters it, in the open and in sight of it.
+def jittered_start(world: World, pose: NDArray[np.floating], seed: int) -> NDArray[np.float64]:
+    """A pose (3,) near `pose` (3,) as the paper jitters it (`cbe_bench.jitter`).
 
     Raises:
         WorldError: there is no room around the pose.
     """
     rng = np.random.default_rng([seed, 23])
-    for _ in range(1000):
-        offset = rng.normal(0.0, JITTER_M, 2)
-        turn = rng.normal(0.0, JITTER_RAD)
-        if np.hypot(*offset) > JITTER_LIMIT_M:
-            continue
-        sight = pose[:2] + np.linspace(0.0, 1.0, 21)[:, None] * offset  # (21, 2)
-        clearance = world.clearance_at(sight)
-        # From the start towards it: nothing between the two, and room at the end.
-        if clearance.min() > world.resolution_m and clearance[-1] >= START_CLEARANCE_M:
-            yaw = float(wrap_angle(pose[2] + turn))
-            return np.array([pose[0] + offset[0], pose[1] + offset[1], yaw])
-    raise WorldError(f"there is no room for a jittered start around {pose.round(2).tolist()}")
+    start = jittered(world, WorldBatch.pack([world]), pose, 1.0, rng)
+    if start is None:
+        raise WorldError(f"there is no room for a jittered start around {pose.round(2).tolist()}")
+    return start
 
 
 def bin_place(world: World, poses: NDArray[np.floating], seed: int) -> NDArray[np.float64]:

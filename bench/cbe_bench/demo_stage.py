@@ -12,7 +12,7 @@ import numpy as np
 
 from cbe.errors import CbeError
 from cbe.robot import STEP_S, Robot
-from cbe_bench.demo_course import bin_place, jittered
+from cbe_bench.demo_course import bin_place, jittered_start
 from cbe_bench.demo_processes import OverdueError, ProcessError
 from cbe_bench.demo_report import ARRIVED, Drive, Repetition
 from cbe_bench.demo_witness import along
@@ -123,7 +123,7 @@ class Stage:
             place = bin_place(world, drive.poses, config.seed)
             self._link.call("obstacle", {"pose": place.tolist()}, timeout_s=30.0)
             bin_pose = (float(place[0]), float(place[1]), float(place[2]))
-        start = jittered(world, drive.poses[0], config.seed)
+        start = jittered_start(world, drive.poses[0], config.seed)
         self._link.call("reset", {"pose": start.tolist()}, timeout_s=30.0)
         recording = config.folder / "repeat.mcap"
         recorder = self._record(recording, "record-repeat")

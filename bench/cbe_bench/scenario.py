@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from cbe.errors import WorldError
 from cbe.robot import Robot
 from cbe_bench.drives import Drives
+from cbe_bench.jitter import CLEARANCE_M, jittered
 from cbe_bench.place import Bin, Place
 from cbe_hil_sim.demonstrator import demonstrate
 from cbe_hil_sim.world import World
@@ -17,10 +18,6 @@ from cbe_hil_sim.world import World
 GROUP = 10
 """Episodes that share a world, so that it is generated and packed once."""
 
-JITTER_M, JITTER_LIMIT_M = 0.3, 1.0
-JITTER_RAD = math.radians(13.5)
-START_CLEARANCE_M = 0.08  # from the body's surface: the car cannot back out of a corner
-SIGHT_CLEARANCE_M = 0.05  # along the line to the demonstration's start
 BIN_MARGIN_SAMPLES = 10
 BIN_PASSAGE_M = 0.6
 BIN_APART_M = 1.5  # from bin to bin, so that the car gets past one side and then the other
@@ -107,7 +104,7 @@ def _in_place(
             part = terms.drives.part(drive.poses, rng)
             if part is None:
                 continue
-            fitted = _fit(terms, world, part, rng)
+            fitted = _fit(terms, place, part, rng)
             if fitted is not None:
                 found[index] = Scenario(index, world_seed, part, *fitted)
         if len(found) == len(streams):
@@ -116,36 +113,19 @@ def _in_place(
 
 
 def _fit(
-    terms: Terms, world: World, drive: NDArray[np.float64], rng: np.random.Generator
+    terms: Terms, place: Place, drive: NDArray[np.float64], rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], tuple[Bin, ...]] | None:
     """A start and bins that suit a demonstration (T, 3), or None."""
     # Streams of their own: with and without bins the start is drawn alike.
     for_start, for_bins = rng.spawn(2)
-    bins: tuple[Bin, ...] = ()
+    world, bins = place.world, tuple[Bin, ...]()
     for _ in range(terms.obstacles):
         bin_ = _place_bin(world, drive, terms.obstacle_offset_m, bins, for_bins)
         if bin_ is None:
             return None
         bins, world = (*bins, bin_), bin_.in_world(world)
-    start = _jitter(world, drive[0], terms.jitter_scale, for_start)
+    start = jittered(world, place.batch, drive[0], terms.jitter_scale, for_start)
     return None if start is None else (start, bins)
-
-
-def _jitter(
-    world: World, pose: NDArray[np.float64], scale: float, rng: np.random.Generator
-) -> NDArray[np.float64] | None:
-    """A start near `pose` (3,), clear of everything and in sight of it, or None."""
-    for _ in range(_TRIES):
-        offset = rng.normal(0.0, 1.0, 2) * JITTER_M * scale
-        offset *= min(1.0, JITTER_LIMIT_M / max(float(np.hypot(*offset)), 1e-9))
-        turn_rad = rng.normal() * JITTER_RAD * scale
-        start: NDArray[np.float64] = pose + np.array([*offset, turn_rad])
-        between = pose[:2] + np.linspace(0.0, 1.0, 21)[:, None] * offset  # (21, 2)
-        clearance = world.clearance_at(between)
-        body = Robot().body_radius_m
-        if clearance[-1] > body + START_CLEARANCE_M and clearance.min() > SIGHT_CLEARANCE_M:
-            return start
-    return None
 
 
 def _place_bin(
@@ -167,7 +147,7 @@ def _place_bin(
         beside = bin_.radius_m + 0.5 * BIN_PASSAGE_M
         passages = centre + np.array([[beside], [-beside]]) * left  # (2, 2)
         ends = np.hypot(*(drive[[0, -1], :2] - centre).T)  # (2,)
-        room = bin_.radius_m + Robot().body_radius_m + START_CLEARANCE_M
+        room = bin_.radius_m + Robot().body_radius_m + CLEARANCE_M
         apart = all(math.dist(centre, (o.x_m, o.y_m)) >= BIN_APART_M for o in others)
         passable = world.clearance_at(passages).max() >= 0.5 * BIN_PASSAGE_M
         if apart and passable and ends.min() > room:

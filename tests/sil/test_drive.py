@@ -8,7 +8,7 @@ import pytest
 
 from cbe.link import Link
 from cbe.linkconfig import LinkConfig
-from cbe_bench.demo_course import jittered
+from cbe_bench.demo_course import jittered_start
 from cbe_hil_sim.demonstrator import sample_routes
 from cbe_hil_sim.generate import TEST_SEEDS, generate
 from cbe_runtime.networks import PACKAGED_MODELS
@@ -102,7 +102,7 @@ def test_shipped_model_arrives_at_the_end_of_a_taught_drive(
     pose = np.array([*path[0], math.atan2(ahead[1], ahead[0])])
     _, link = simulator("--lockstep", "--start=" + ",".join(map(str, pose.tolist())))
     route, poses = taught(start, endpoint, link, until, path, PACKAGED_MODELS, tmp_path)
-    link.call("reset", {"pose": jittered(world, pose, seed=0).tolist()}, CALL_S)
+    link.call("reset", {"pose": jittered_start(world, pose, seed=0).tolist()}, CALL_S)
 
     runtime = start(
         "cbe-runtime", "--memory", route, "--connect", endpoint, "--clock", "sim",
