@@ -40,7 +40,8 @@ class FollowerConfig:
 
     fresh_s: float = 0.3  # an older image or scan stops the robot
     switch_progress: float = 0.95  # phi >= 0.95 starts the next behavior, Sec. III-D
-    arrival_progress: float = 0.95  # the same on the last behavior means ARRIVED
+    arrival_progress: float = 0.95  # the same on the last behavior means ARRIVED, where
+    arrival_steps: float = 6.4  # no more is left: 0.95 of 256 steps is still 0.6 m from the end
     resting_progress: float = 0.85  # enough where the waypoint says that the end is here:
     resting_range_m: float = 0.05  # a progress that stalls below the threshold must not strand it
     progress_ticks: int = 2  # network ticks in a row that must agree, against flicker
@@ -49,10 +50,11 @@ class FollowerConfig:
     lost: LostConfig = field(default_factory=LostConfig)
     join: JoinConfig = field(default_factory=JoinConfig)
 
-    def ends(self, prediction: Prediction, *, last: bool) -> bool:
-        """Whether a tick says that the behavior, the route's last or another, is done."""
+    def ends(self, prediction: Prediction, steps: int, *, last: bool) -> bool:
+        """Whether a tick says that a behavior of so many steps, a route's last or not, is done."""
         progress = prediction.progress
-        if progress >= (self.arrival_progress if last else self.switch_progress):
+        arrival = max(self.arrival_progress, 1.0 - self.arrival_steps / steps)
+        if progress >= (arrival if last else self.switch_progress):
             return True
         range_m = math.hypot(*prediction.waypoint_m) - OVERRUN_M
         return progress >= self.resting_progress and range_m < self.resting_range_m
@@ -282,7 +284,7 @@ class Follower:
     def _judge_progress(self, prediction: Prediction) -> None:
         """Start the next behavior, or arrive, once enough ticks in a row say so."""
         last = self._behavior.last
-        done = self._config.ends(prediction, last=last)
+        done = self._config.ends(prediction, self._behavior.steps, last=last)
         self._done_ticks = self._done_ticks + 1 if done else 0
         if self._done_ticks < self._config.progress_ticks:
             return

@@ -142,14 +142,15 @@ def _segment(
         name: _replay(networks, route, index, views, kind)
         for name, kind in {AS_IT_IS: as_it_is, **perturbations}.items()
     }
-    shares = _steps(networks, views) / (len(views) - 1)
+    steps = len(views) - 1
+    shares = _steps(networks, views) / steps
     last = index + 1 == len(route.segments)
-    replays = {name: _measure(each, shares, last=last) for name, each in seen.items()}
+    replays = {name: _measure(each, shares, steps, last=last) for name, each in seen.items()}
     correction = None
     if {LEFT, RIGHT} <= seen.keys():
         from_left_to_right_rad = 2.0 * math.atan(TURN_PX / networks.camera.fx)
         correction = _turn(seen[LEFT], seen[RIGHT], shares) / from_left_to_right_rad
-    return Segment(index, len(views) - 1, replays, correction)
+    return Segment(index, steps, replays, correction)
 
 
 def _cut(route: Route, frames: Iterable[NDArray[np.uint8]]) -> Iterator[Views]:
@@ -206,14 +207,16 @@ def _replay(
     ]
 
 
-def _measure(seen: Sequence[Prediction], shares: NDArray[np.float64], *, last: bool) -> Replay:
+def _measure(
+    seen: Sequence[Prediction], shares: NDArray[np.float64], steps: int, *, last: bool
+) -> Replay:
     progress = np.array([each.progress for each in seen])
     waypoints_m = np.stack([each.waypoint_m for each in seen])  # (T, 2)
     moves = np.hypot(*np.diff(waypoints_m, axis=0).T)
     return Replay(
         progress_error=float(np.abs(progress - shares).mean()),
         progress_end=float(progress[-1]),
-        done_at=_done_at(seen, shares, last=last),
+        done_at=_done_at(seen, shares, steps, last=last),
         waypoint_ahead=float((waypoints_m[shares < END_SHARE, 0] > 0.0).mean()),
         waypoint_change_m=float(moves.mean()),
         on_route=float(np.mean([each.on_route for each in seen])),
@@ -231,13 +234,13 @@ def _turn(
 
 
 def _done_at(
-    seen: Sequence[Prediction], shares: NDArray[np.float64], *, last: bool
+    seen: Sequence[Prediction], shares: NDArray[np.float64], steps: int, *, last: bool
 ) -> float | None:
     """The share of the frames after which the follower would leave the segment."""
     config = FollowerConfig()
     agreeing = 0
     for prediction, share in zip(seen, shares, strict=True):
-        agreeing = agreeing + 1 if config.ends(prediction, last=last) else 0
+        agreeing = agreeing + 1 if config.ends(prediction, steps, last=last) else 0
         if agreeing >= config.progress_ticks:
             return float(share)
     # Standing at the end, it would go on seeing what it saw last.
