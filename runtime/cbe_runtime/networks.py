@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import onnxruntime as ort
 
 from cbe import signature
 from cbe.errors import ModelError
+from cbe_runtime.graph import Graph
 from cbe_runtime.modelfile import (
-    ORT_FAULTS,
     ModelFile,
     check_graph,
     open_session,
@@ -75,16 +74,17 @@ class Networks:
         generator: ort.InferenceSession,
         metadata: Metadata,
     ) -> None:
-        self._encoder = encoder
-        self._attractor = attractor
-        self._generator = generator
+        self._encoder = encoder = Graph(encoder, "encoder")
+        self._attractor = Graph(attractor, "attractor")
+        self._generator = generator = Graph(generator, "generator")
         self._metadata = metadata
         self._first_state = EncoderState(
-            np.zeros((1, *signature.FEATURES), np.float32),
+            encoder.zeros("previous_features"),
             np.ones(1, np.float32),
-            *_zero_state(encoder),
+            encoder.zeros("h"),
+            encoder.zeros("c"),
         )
-        self._first_generator_state = GeneratorState(*_zero_state(generator))
+        self._first_generator_state = GeneratorState(generator.zeros("h"), generator.zeros("c"))
         self._not_first = np.zeros(1, np.float32)
 
     @classmethod
@@ -164,9 +164,7 @@ class Networks:
         Raises:
             ModelError: an output is not finite.
         """
-        features, embedding, h, c = self._run(
-            self._encoder,
-            "encoder",
+        features, embedding, h, c = self._encoder.run(
             {
                 "image": image[None],  # (1, 64, 64, 3)
                 "previous_features": state.features,
@@ -184,7 +182,7 @@ class Networks:
             ModelError: an output is not finite.
         """
         attractor: NDArray[np.float32]
-        (attractor,) = self._run(self._attractor, "attractor", {"features": features})
+        (attractor,) = self._attractor.run({"features": features})
         return attractor.reshape(-1)  # (1, 400) to (400,)
 
     def generate(
@@ -206,9 +204,7 @@ class Networks:
         Raises:
             ModelError: an output is not finite.
         """
-        waypoint_m, progress, on_route, h, c = self._run(
-            self._generator,
-            "generator",
+        waypoint_m, progress, on_route, h, c = self._generator.run(
             {
                 "attractor_now": attractor_now[None],
                 "attractor_first": attractor_first[None],
@@ -224,25 +220,3 @@ class Networks:
             waypoint_m[0].astype(np.float64), float(progress[0]), float(on_route[0])
         )
         return prediction, GeneratorState(h, c)
-
-    @staticmethod
-    def _run(
-        session: ort.InferenceSession, name: str, inputs: dict[str, NDArray[Any]]
-    ) -> list[NDArray[np.float32]]:
-        try:
-            outputs: list[NDArray[np.float32]] = session.run(None, inputs)
-        except ORT_FAULTS as fault:
-            raise ModelError(f"the {name} network failed: {fault}") from fault
-        # Any inf or NaN makes the sum of squares non-finite: one pass, no temporary mask.
-        if not math.isfinite(sum(float(np.vdot(output, output)) for output in outputs)):
-            raise ModelError(
-                f"the {name} network put out a value that is not finite; stop and check it"
-            )
-        return outputs
-
-
-def _zero_state(session: ort.InferenceSession) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """`h` and `c` (1, state) of a network before its first tick."""
-    (shape,) = (node.shape for node in session.get_inputs() if node.name == "h")
-    zeros = np.zeros(shape, np.float32)
-    return zeros, zeros
