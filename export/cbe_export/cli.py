@@ -29,6 +29,10 @@ def main() -> int:
     parser.add_argument(
         "--cache", type=Path, default=Path("runs/drives"), help="folder of cached drives"
     )
+    parser.add_argument(
+        "--precision", choices=("fp32", "int8"), default="fp32",
+        help="int8: weights and activations of 8 bits, calibrated on rollouts",
+    )  # fmt: skip
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     try:
@@ -38,6 +42,7 @@ def main() -> int:
             network_period=arguments.network_period,
             segment_steps=arguments.segment_steps,
             cache=arguments.cache,
+            precision=arguments.precision,
         )
     except CbeError as error:
         sys.stderr.write(f"cbe-export: {error}\n")

@@ -8,9 +8,7 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import onnx
-import onnx.numpy_helper
 import torch
 
 from cbe import signature
@@ -18,12 +16,13 @@ from cbe.camera import MODEL_CAMERA
 from cbe.errors import ModelError
 from cbe_export.graphs import ticks
 from cbe_export.parity import Rides, worst_difference
+from cbe_export.quantise import quantise
+from cbe_export.storing import store_in_half, strip
 from cbe_training.checkpoint import load_networks
 from cbe_training.networks import BehaviorNetworks
 
 TOLERANCE = 1e-4
 LEAST_TICKS = 200
-LARGE = 1024  # numbers: smaller tensors are not worth a node
 OPSET = 18
 
 logger = logging.getLogger(__name__)
@@ -40,9 +39,15 @@ class Exported:
 
 
 def export(
-    checkpoint: Path, folder: Path, *, network_period: int, segment_steps: int, cache: Path
+    checkpoint: Path,
+    folder: Path,
+    *,
+    network_period: int,
+    segment_steps: int,
+    cache: Path,
+    precision: str = "fp32",
 ) -> Exported:
-    """Export the checkpoint's averaged networks to `folder`.
+    """Export the checkpoint's averaged networks to `folder`, in `fp32` or quantised to `int8`.
 
     Raises ModelError, writing nothing, if onnxruntime differs from torch by more than 1e-4
     anywhere in at least 200 ticks of real rollouts.
@@ -52,7 +57,11 @@ def export(
     with tempfile.TemporaryDirectory() as scratch:
         staging = Path(scratch)
         model_id = write_graphs(
-            networks, staging, network_period=network_period, segment_steps=segment_steps
+            networks,
+            staging,
+            network_period=network_period,
+            segment_steps=segment_steps,
+            precision=precision,
         )
         worst, count = worst_difference(networks, staging, rides)
         if not worst <= TOLERANCE or count < LEAST_TICKS:
@@ -60,6 +69,8 @@ def export(
                 f"onnxruntime differs from torch by {worst:.2g} over {count} ticks; expected at "
                 f"most {TOLERANCE} over at least {LEAST_TICKS}; nothing was written"
             )
+        if precision == "int8":
+            quantise(networks, staging, rides)
         folder.mkdir(parents=True, exist_ok=True)
         sizes = {}
         for path in sorted(staging.glob("*.onnx")):
@@ -72,9 +83,9 @@ def export(
     return Exported(model_id, worst, count, sizes)
 
 
-def identify(networks: BehaviorNetworks) -> str:
+def identify(networks: BehaviorNetworks, precision: str = "fp32") -> str:
     """16 hex digits that change with the weights, the preprocessing or the quantisation."""
-    digest = hashlib.sha256(f"{signature.CONTRACT_VERSION} {_camera()} fp32".encode())
+    digest = hashlib.sha256(f"{signature.CONTRACT_VERSION} {_camera()} {precision}".encode())
     for name, value in sorted(networks.state_dict().items()):
         digest.update(name.encode())
         digest.update(value.cpu().numpy().tobytes())
@@ -91,16 +102,20 @@ def write_graphs(
     *,
     network_period: int,
     segment_steps: int,
+    precision: str = "fp32",
 ) -> str:
-    """Write a file for each graph of `cbe.signature`; returns the model id."""
-    model_id = identify(networks)
+    """Write a file for each graph of `cbe.signature`; returns the model id.
+
+    `precision` is what the model is named after; the graphs are not yet quantised.
+    """
+    model_id = identify(networks, precision)
     values = (
         str(signature.CONTRACT_VERSION),
         model_id,
         str(network_period),
         _camera(),
         str(segment_steps),
-        "fp32",
+        precision,
     )
     metadata = dict(zip(signature.METADATA_KEYS, values, strict=True))
     for graph, module in ticks(networks):
@@ -129,40 +144,3 @@ def write_graphs(
         onnx.checker.check_model(model, full_check=True)
         onnx.save(model, path)
     return model_id
-
-
-def strip(graph: onnx.GraphProto) -> None:
-    """Leave out what the exporter notes of the code it came from, half as large as the weights."""
-    del graph.metadata_props[:]
-    del graph.value_info[:]
-    graph.doc_string = ""
-    for node in graph.node:
-        del node.metadata_props[:]
-        node.doc_string = ""
-        for attribute in node.attribute:
-            if attribute.type == onnx.AttributeProto.GRAPH:
-                strip(attribute.g)
-    for value in (*graph.input, *graph.output, *graph.initializer):
-        del value.metadata_props[:]
-        value.doc_string = ""
-
-
-def store_in_half(model: onnx.ModelProto) -> None:
-    """Store large weights as float16 where nothing is lost, cast back as the session is made."""
-    graph = model.graph
-    casts = []
-    for tensor in graph.initializer:
-        value = onnx.numpy_helper.to_array(tensor)
-        if value.dtype != np.float32 or value.size < LARGE:
-            continue
-        half = value.astype(np.float16)
-        if not np.array_equal(half, value):
-            continue
-        name = tensor.name
-        tensor.CopyFrom(onnx.numpy_helper.from_array(half, f"{name}.half"))
-        casts.append(
-            onnx.helper.make_node("Cast", [tensor.name], [name], to=onnx.TensorProto.FLOAT)
-        )
-    nodes = [*casts, *graph.node]
-    del graph.node[:]
-    graph.node.extend(nodes)

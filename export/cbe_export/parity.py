@@ -1,7 +1,9 @@
 """The parity gate: torch against onnxruntime over real rollouts, recurrent state carried."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 import onnxruntime
@@ -20,6 +22,16 @@ from cbe_training.rollout import roll_out, show
 BEHAVIORS, FRAMES = 4, 40
 
 Arrays = dict[str, NDArray[np.generic]]
+
+
+class Session(Protocol):
+    """What is asked of an `onnxruntime.InferenceSession`."""
+
+    def get_outputs(self) -> Any:
+        """Its outputs, in order, with their names."""
+
+    def run(self, names: list[str], inputs: Arrays) -> Any:
+        """The outputs of these names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +65,7 @@ def worst_difference(networks: BehaviorNetworks, folder: Path, rides: Rides) -> 
     worst, ticks = 0.0, 0
     for images, frames, shown in zip(rides.images, rides.frames, rides.shown, strict=True):
         expected = _run_torch(networks, images[:frames], shown)
-        found = _run_onnx(networks, sessions, images[:frames], shown)
+        found = replay(networks, sessions, images[:frames], shown)
         worst = max(worst, float(np.abs(expected - found).max()))
         ticks += int(frames)
     return worst, ticks
@@ -83,13 +95,16 @@ def _run_torch(
     return torch.cat([*parts, z, paths], dim=-1)[0].numpy()
 
 
-def _run_onnx(
+def replay(
     networks: BehaviorNetworks,
-    sessions: dict[str, onnxruntime.InferenceSession],
+    sessions: Mapping[str, Session],
     images: NDArray[np.uint8],
     shown: NDArray[np.uint8],
 ) -> NDArray[np.float32]:
-    """The same (T, 52), tick by tick."""
+    """The same (T, 52) as onnxruntime has it, tick by tick.
+
+    Of images (T, 64, 64, 3) of a repetition, and `shown` those of the demonstration.
+    """
 
     def look(frames: NDArray[np.uint8]) -> tuple[Arrays, list[Arrays]]:
         state = _zeros(encoder_signature(networks))
@@ -127,6 +142,6 @@ def _zeros(graph: signature.Graph) -> Arrays:
     return {t.name: np.zeros(t.shape, np.float32) for t in graph.inputs}
 
 
-def _call(session: onnxruntime.InferenceSession, inputs: Arrays) -> Arrays:
+def _call(session: Session, inputs: Arrays) -> Arrays:
     names = [output.name for output in session.get_outputs()]
     return dict(zip(names, session.run(names, inputs), strict=True))

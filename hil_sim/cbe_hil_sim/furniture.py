@@ -243,6 +243,22 @@ def boxes(rng: Rng) -> Piece:
     return Piece(w, d, tuple(parts))
 
 
+def shelving(rng: Rng) -> Piece:
+    """Shelves on posts with boxes below and above."""
+    w, d = rng.uniform(1.2, 3.0), rng.uniform(0.5, 1.1)
+    steel, low = pick(rng, "lacquer"), rng.uniform(0.2, 1.3)
+    gap = low + rng.uniform(0.3, 0.8)
+    top = gap + rng.uniform(0.4, 1.6)
+    below, above = pick(rng, "box", "bookshelf"), pick(rng, "box", "bookshelf", "photo")
+    parts = [Part(0.0, 0.0, w - 0.2, d - 0.1, 0.0, low, below, below)]
+    parts += [Part(0.0, 0.0, w, d, gap, top, above, above)]
+    parts += [
+        Part(u, v, 0.08, 0.08, 0.0, top + 0.2, steel, steel)
+        for u, v in _corners(w / 2 - 0.04, d / 2 - 0.04)
+    ]
+    return Piece(w, d, tuple(parts))
+
+
 def floor_lamp(rng: Rng) -> Piece:
     """Foot, pole and shade."""
     pole, shade = pick(rng, "lacquer"), pick(rng, "lamp", "fabric")
@@ -280,6 +296,11 @@ rack = block((0.9, 2.2), (0.4, 0.6), (1.6, 2.1), "bookshelf", "box")
 crate = block((0.3, 0.8), (0.3, 0.6), (0.25, 0.9), "box", "photo")
 stool = block((0.3, 0.5), (0.3, 0.5), (0.4, 0.5), "fabric", "wood", cap="fabric", round=True)
 bin_ = block((0.25, 0.35), (0.25, 0.35), (0.3, 0.65), "lacquer", round=True)
+stack = block((0.7, 1.6), (0.7, 1.2), (0.6, 3.0), "box", "box", "appliance")
+divider = block(
+    (1.0, 3.2), (0.05, 0.15), (1.5, 2.5),
+    "lacquer", "fabric", "plain_ceiling", "wood", "brick", "panelling",
+)  # fmt: skip
 island = block((1.2, 2.2), (0.6, 0.9), (0.88, 0.95), "cabinet", "panelling", cap="marble")
 screen_wall = block((1.0, 2.0), (0.1, 0.1), (1.3, 1.9), "fabric", "mural", "photo")
 column = block((0.3, 0.5), (0.3, 0.5), (0.0, TO_CEILING_M), "plaster", "marble", "brick")
@@ -323,6 +344,10 @@ SETS: dict[str, Set] = {
     "open_office": Set(
         (), (bookcase, cabinet, copier, plant, sofa, wardrobe, screen_wall, bin_),
         (cubicles, cubicles, column, round_column, plant, screen_wall), 1.2,
+    ),
+    "hall": Set(
+        (), (shelving, stack, rack, boxes, wardrobe, screen_wall, copier),
+        (shelving, shelving, stack, divider, divider, column, round_column, crate), 0.3,
     ),
     "meeting": Set(
         (), (cabinet, low_shelf, plant, television, bench), (dining_table, screen_wall),

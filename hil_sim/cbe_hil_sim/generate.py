@@ -1,4 +1,4 @@
-"""Generated worlds: furnished houses, apartments and offices from a seed."""
+"""Generated worlds: furnished houses, apartments, offices and halls from a seed."""
 
 from dataclasses import dataclass, field
 
@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from cbe.errors import WorldError
 from cbe_hil_sim.layout import Layout, Opening, Rect, draw_layout, to_cells
+from cbe_hil_sim.patterns import colour
 from cbe_hil_sim.placing import Footprint, Placer
 from cbe_hil_sim.surfacing import Look, SurfaceTable, Tint, draw_looks, pick
 from cbe_hil_sim.textures import bank
@@ -16,6 +17,9 @@ TRAIN_SEEDS = range(100_000)
 VALIDATION_SEEDS = range(100_000, 110_000)
 TEST_SEEDS = range(200_000, 210_000)
 SPLIT_SEEDS = {"train": TRAIN_SEEDS, "validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
+
+HALL_EVERY = 3
+"""Every so many worlds, the last one is of halls."""
 
 Rng = np.random.Generator
 Heights = NDArray[np.float32]
@@ -35,6 +39,11 @@ def split_of(seed: int) -> str:
     raise WorldError(f"world seed {seed} is in no split; use one of: {ranges}")
 
 
+def is_hall(seed: int) -> bool:
+    """Whether the world of `seed` is of halls: few, large, high rooms with bare floors."""
+    return seed % HALL_EVERY == HALL_EVERY - 1
+
+
 def generate(seed: int) -> World:
     """Build the world of `seed`, the same one each time; all its floor is reachable.
 
@@ -45,8 +54,10 @@ def generate(seed: int) -> World:
     """
     split = split_of(seed)
     rng = np.random.default_rng([seed, 7])
-    layout = draw_layout(rng)
-    builder = Builder(layout, rng, round(float(rng.uniform(2.3, 3.2)), 2))
+    hall = is_hall(seed)
+    layout = draw_layout(rng, hall=hall)
+    ceiling_m = rng.uniform(2.5, 7.0) if hall else rng.uniform(2.3, 3.2)
+    builder = Builder(layout, rng, round(float(ceiling_m), 2))
     builder.build()
     return builder.finish(bank(split), f"{layout.style}-{seed}")
 
@@ -110,16 +121,34 @@ class Builder:
         self.solid_top[rect.slices] = 0.0
         size = (look.floor_size_m, look.floor_size_m)
         offset = (float(rng.uniform(0, 3)), float(rng.uniform(0, 3)), 0.0)
-        self.floor[rect.slices] = self.table.add(look.floor, size, look.tint, offset)
+        floor_tint = look.tint * look.floor_tint
+        self.floor[rect.slices] = self.table.add(look.floor, size, floor_tint, offset)
         self.ceiling[rect.slices] = self.table.add(look.ceiling, (2.4, 2.4), look.tint)
         for texture, strip in zip(look.walls, _strips(rect), strict=True):
             offset = (float(rng.uniform(0, 5)), float(rng.uniform(0, 5)), 0.0)
-            repeat = (look.wall_width_m, self.ceiling_m)
+            repeat = (look.wall_width_m, self.ceiling_m / max(round(self.ceiling_m / 3.0), 1))
             row = self.table.add(texture, repeat, look.tint, offset)
             self.side[strip] = self.span[strip] = row
         if rng.random() < 0.4 and min(rect.width, rect.height) > 40:
             rug = self._somewhere(rect, (1.0, 3.2), 4)
             self.floor[rug.slices] = self._fitted(pick(rng, "rug"), rug, look.tint)
+        if self.layout.rooms[index].kind == "hall" and rng.random() < 0.6:
+            self._mark_lanes(rect, look.tint)
+
+    def _mark_lanes(self, rect: Rect, light: Tint) -> None:
+        """Paint lines along and across a hall's floor, some of them dashed."""
+        rng = self.rng
+        paint = pick(rng, "plain_ceiling")
+        for _ in range(int(rng.integers(1, 7))):
+            row = self.table.add(paint, (3.0, 3.0), light * colour(rng, (0.0, 0.9)) / 255.0)
+            width = int(rng.integers(1, 4))
+            dash = int(rng.integers(4, 30)) if rng.random() < 0.3 else 0
+            area = self.floor[rect.slices]
+            area = area if rng.random() < 0.5 else area.T
+            at = int(rng.integers(len(area) - width))
+            first, last = np.sort(rng.integers(area.shape[1], size=2))
+            along = np.arange(first, last)
+            area[at : at + width, along[(along // dash) % 2 == 0] if dash else along] = row
 
     def _cut(self, opening: Opening, frame: int | None) -> None:
         """Open a wall: free below, a lintel above; each half belongs to the nearer room."""

@@ -1,10 +1,11 @@
 """A world's surface table while it grows, and the look of each room."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cbe_hil_sim.patterns import colour
 from cbe_hil_sim.textures import FAMILIES
 from cbe_hil_sim.world import Surfaces
 
@@ -67,6 +68,7 @@ class Look:
     wall_width_m: float
     floor: int
     floor_size_m: float
+    floor_tint: Tint
     ceiling: int
     tint: Tint
 
@@ -120,8 +122,21 @@ def draw_looks(rng: Rng, kinds: list[str], style: str) -> list[Look]:
                 width_m if rng.random() < 0.5 else float(rng.uniform(2.0, 6.0)),
                 floor,
                 float(rng.uniform(1.6, 3.2)),
+                np.ones(3),
                 ceiling,
                 shared_light if rng.random() < 0.3 else light(rng),
             )
         )
-    return looks
+    return [_bare(rng, look) for look in looks] if style == "hall" else looks
+
+
+def _bare(rng: Rng, look: Look) -> Look:
+    """A hall's look: plain paint on most floors and walls, with little to tell a step by."""
+    walls = look.walls if rng.random() < 0.3 else (pick(rng, "plaster"),) * 4
+    if rng.random() < 0.7:
+        paint = colour(rng, (0.0, 0.35), (0.3, 1.0)).astype(np.float64) / 255.0
+        floor, size_m = pick(rng, "plain_ceiling"), rng.uniform(3.0, 20.0)
+    else:
+        paint, floor = np.ones(3), pick(rng, "marble", "carpet", "tile_floor")
+        size_m = rng.uniform(2.0, 8.0)
+    return replace(look, walls=walls, floor=floor, floor_size_m=float(size_m), floor_tint=paint)

@@ -1,5 +1,6 @@
 """Export: the graphs match the signature, parity is measured, and a failed gate writes nothing."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ from cbe.errors import ModelError
 from cbe_export import export as export_module
 from cbe_export.export import identify, write_graphs
 from cbe_export.parity import Rides, worst_difference
+from cbe_export.quantise import quantise
+from cbe_export.storing import restore_from_half, store_in_half
 from cbe_runtime.networks import Networks
 from cbe_runtime.pathshape import PathShape
 from cbe_training.layout import path_of
@@ -65,6 +68,35 @@ def test_onnxruntime_agrees_with_torch_through_the_recurrence(
     worst, ticks = worst_difference(networks, folder, rides)
     assert ticks == 11
     assert worst < 1e-4
+
+
+def test_quantised_graphs_load_and_answer_nearly_the_same(
+    networks: BehaviorNetworks, folder: Path, rides: Rides, tmp_path: Path
+) -> None:
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    other_id = write_graphs(
+        networks, tmp_path, network_period=2, segment_steps=100, precision="int8"
+    )
+    quantise(networks, tmp_path, rides)
+    loaded = Networks.load(tmp_path)
+    assert loaded.precision == "int8"
+    assert loaded.model_id == other_id != Networks.load(folder).model_id
+    assert (tmp_path / "encoder.onnx").stat().st_size < (folder / "encoder.onnx").stat().st_size
+    worst, _ = worst_difference(networks, tmp_path, rides)
+    assert 1e-4 < worst < 0.5
+
+
+def test_weights_come_back_from_half_as_they_were(tmp_path: Path) -> None:
+    halved = BehaviorNetworks().half().float().eval()
+    write_graphs(halved, tmp_path, network_period=2, segment_steps=100)
+    model = onnx.load(tmp_path / "encoder.onnx")
+    halves = sum(t.data_type == onnx.TensorProto.FLOAT16 for t in model.graph.initializer)
+    stored = model.SerializeToString()
+    restore_from_half(model)
+    assert halves > 0
+    assert all(t.data_type != onnx.TensorProto.FLOAT16 for t in model.graph.initializer)
+    store_in_half(model)
+    assert len(model.SerializeToString()) == len(stored)
 
 
 def test_parity_notices_a_changed_weight(

@@ -11,6 +11,7 @@ from cbe_hil_sim.generate import (
     TRAIN_SEEDS,
     VALIDATION_SEEDS,
     generate,
+    is_hall,
     split_of,
 )
 from cbe_hil_sim.layout import draw_layout
@@ -35,10 +36,10 @@ def test_outer_walls_close_the_world(world):
     np.testing.assert_allclose(edge, world.ceiling_m)
 
 
-def test_building_is_between_100_and_600_m2(world):
+def test_building_is_between_100_and_700_m2(world):
     width_m, height_m = world.size_m
     assert width_m * height_m >= 100.0
-    assert (world.solid_top_m < world.ceiling_m).sum() * RESOLUTION_M**2 <= 600.0
+    assert (world.solid_top_m < world.ceiling_m).sum() * RESOLUTION_M**2 <= 700.0
 
 
 def test_spans_hang_above_what_stands_and_below_the_ceiling(world):
@@ -56,7 +57,7 @@ def test_surface_rows_are_in_range(world):
     assert max(int(grid.max()) for grid in (*grids, world.ceiling_surface)) < rows
     assert 0 <= world.surfaces.texture.min() <= world.surfaces.texture.max() < len(world.textures)
     assert (world.surfaces.size_m > 0.0).all()
-    assert 0.1 < world.surfaces.tint.min() < world.surfaces.tint.max() <= 1.6
+    assert 0.0 < world.surfaces.tint.min() < world.surfaces.tint.max() <= 1.6
 
 
 def test_world_has_furniture_of_many_heights(world):
@@ -79,7 +80,7 @@ def test_different_seeds_give_different_worlds():
 @pytest.mark.parametrize("seed", range(40))
 def test_doors_are_wide_enough_and_free_on_both_sides(seed):
     world = generate(seed)
-    layout = draw_layout(np.random.default_rng([seed, 7]))
+    layout = draw_layout(np.random.default_rng([seed, 7]), hall=is_hall(seed))
     assert layout.shape == world.solid_top_m.shape
     for opening in layout.openings:
         assert opening.width * RESOLUTION_M >= 0.8 - 1e-9
@@ -91,7 +92,7 @@ def test_doors_are_wide_enough_and_free_on_both_sides(seed):
 
 @pytest.mark.parametrize("seed", range(40))
 def test_every_room_of_a_layout_is_joined_to_every_other(seed):
-    layout = draw_layout(np.random.default_rng(seed))
+    layout = draw_layout(np.random.default_rng(seed), hall=is_hall(seed))
     reached, grown = {0}, True
     while grown:
         pairs = [{o.first, o.second} for o in layout.openings]
@@ -99,6 +100,18 @@ def test_every_room_of_a_layout_is_joined_to_every_other(seed):
         grown = not more <= reached
         reached |= more
     assert reached == set(range(len(layout.rooms)))
+
+
+def test_every_third_world_is_of_halls_large_high_and_bare():
+    halls = [seed for seed in range(30) if is_hall(seed)]
+    assert len(halls) == 10
+    worlds = [generate(seed) for seed in halls]
+    assert all(world.name.startswith("hall") for world in worlds)
+    assert max(world.ceiling_m for world in worlds) > 5.0
+    plain = textures.FAMILIES["plain_ceiling"]
+    floors = [world.surfaces.texture[world.floor_surface[~world.blocked]] for world in worlds]
+    bare = [np.isin(floor, np.arange(plain.start, plain.stop)).mean() for floor in floors]
+    assert np.median(bare) > 0.5
 
 
 def test_seed_ranges_of_the_splits_do_not_meet():
