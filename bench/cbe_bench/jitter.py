@@ -38,14 +38,21 @@ def jittered(
     `batch` holds the one world that the views are of; what stands in `world` beyond it only
     takes room. At scale 0 the start is the pose itself.
     """
-    pose = np.asarray(pose, np.float64)
+    own: NDArray[np.float64] = np.asarray(pose, np.float64)
     for _ in range(_TRIES if scale > 0.0 else 0):
         offset = rng.normal(0.0, 1.0, 2) * JITTER_M * scale
         offset *= min(1.0, JITTER_LIMIT_M / max(float(np.hypot(*offset)), 1e-9))
-        start = pose + np.array([*offset, rng.normal() * JITTER_RAD * scale])
-        if _has_room(world, start) and min(view_overlap(batch, start, pose)) >= MIN_OVERLAP:
+        start: NDArray[np.float64] = own + np.array([*offset, rng.normal() * JITTER_RAD * scale])
+        if is_kept(world, batch, start, own):
             return start
-    return None if scale > 0.0 else pose
+    return None if scale > 0.0 else own
+
+
+def is_kept(
+    world: World, batch: WorldBatch, start: NDArray[np.float64], pose: NDArray[np.float64]
+) -> bool:
+    """Whether a start (3,) beside a demonstrated pose (3,) has room and a like view."""
+    return _has_room(world, start) and min(view_overlap(batch, start, pose)) >= MIN_OVERLAP
 
 
 def _has_room(world: World, start: NDArray[np.float64]) -> bool:

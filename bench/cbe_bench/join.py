@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cbe.errors import WorldError
-from cbe.robot import STEP_S, Robot
+from cbe.robot import STEP_S
 from cbe_bench.episode import Outcome, ride
 from cbe_bench.evaluation import RunConfig, Stage, each_episode, stored_route
+from cbe_bench.jitter import is_kept
 from cbe_bench.route import Teaching
-from cbe_bench.scenario import SIGHT_CLEARANCE_M, START_CLEARANCE_M
 from cbe_bench.tally import wilson
 from cbe_hil_sim.world import World
+from cbe_hil_sim.worldbatch import WorldBatch
 from cbe_runtime.follower import Decision, Follower
 from cbe_runtime.networks import Networks
 from cbe_runtime.observation import Observation
@@ -123,7 +124,7 @@ def _drive(config: JoinConfig, stage: Stage) -> Joined:
     demonstration = stage.scenario.demonstration
     rng = np.random.default_rng([config.run.terms.seed, stage.scenario.index, 4])
     route, _ = stored_route(stage, config.teaching)
-    at, start = _beside(stage.place.world, demonstration, rng)
+    at, start = _beside(stage.place.world, stage.place.batch, demonstration, rng)
     joiner = _Joiner(Follower(stage.networks, route), route)
     with stage.place.backend(noise=config.run.noise, rng=rng) as (backend, see):
         driven = ride(joiner, backend, see, demonstration[at:], start)
@@ -144,19 +145,20 @@ def _nearest(demonstration: NDArray[np.float64], poses: NDArray[np.float64]) -> 
 
 
 def _beside(
-    world: World, demonstration: NDArray[np.float64], rng: np.random.Generator
+    world: World,
+    batch: WorldBatch,
+    demonstration: NDArray[np.float64],
+    rng: np.random.Generator,
 ) -> tuple[int, NDArray[np.float64]]:
-    """A step of a demonstration (T, 3), and a clear pose (3,) off it, in sight of it."""
+    """A step of a demonstration (T, 3), and a pose (3,) off it, kept as jittered starts are."""
     for _ in range(_TRIES):
         at = int(rng.integers(0, len(demonstration) - LEFT_STEPS))
         angle = rng.uniform(-math.pi, math.pi)
         offset = OFF_M * np.array([math.cos(angle), math.sin(angle)])
         turn = OFF_RAD if rng.random() < 0.5 else -OFF_RAD
-        between = demonstration[at, :2] + np.linspace(0.0, 1.0, 21)[:, None] * offset  # (21, 2)
-        clearance = world.clearance_at(between)
-        room = Robot().body_radius_m + START_CLEARANCE_M
-        if clearance[-1] > room and clearance.min() > SIGHT_CLEARANCE_M:
-            return at, demonstration[at] + np.array([*offset, turn])
+        start = demonstration[at] + np.array([*offset, turn])
+        if is_kept(world, batch, start, demonstration[at]):
+            return at, start
     raise WorldError(
         f"world {world.name!r} has no clear place {OFF_M} m off the drive; take another world"
     )

@@ -43,7 +43,11 @@ class BarError(CbeError):
 
 @dataclass(frozen=True, slots=True)
 class Soaked:
-    """What was measured of one runtime's process; CPU as a share of one core."""
+    """What was measured of one runtime's process; CPU as a share of one core.
+
+    `stolen` is the share of the time wanted by all processes that a virtual machine's host gave to
+    others: a tick that falls into such a gap is late whatever the runtime does.
+    """
 
     minutes: float
     laps: int
@@ -55,6 +59,7 @@ class Soaked:
     rss_mib: float
     growth_mib: float
     cpu: float
+    stolen: float
 
     @property
     def failures(self) -> list[str]:
@@ -84,6 +89,7 @@ class Soaked:
             ("worst tick", f"{self.worst_tick_ms:.1f} ms", f"< {WORST_MS:g} ms"),
             ("camera to command", f"{answered['p50']} / {answered['p99']} ms", ""),
             ("RSS, CPU", f"{self.rss_mib:.0f} MiB, {100 * self.cpu:.1f} % of one core", ""),
+            ("taken by the host", f"{100 * self.stolen:.1f} % of the time wanted", ""),
         )
         return "\n".join(f"{name:<20} {value:<34} {bar}".rstrip() for name, value, bar in rows)
 
@@ -120,6 +126,7 @@ def _soak(link: Link, runtime: Child, course: Course, duration_s: float) -> Soak
     statuses = link.latest_json("status")
     before = status = _first(statuses, runtime)
     began_s, cpu_s = time.monotonic(), _cpu_s(runtime.pid)
+    wanted, stolen = _processors()
     laps, lap_s = 0, -np.inf
     rss: list[float] = []
     while (now_s := time.monotonic()) - began_s < duration_s:
@@ -151,6 +158,7 @@ def _soak(link: Link, runtime: Child, course: Course, duration_s: float) -> Soak
         rss_mib=max(rss),
         growth_mib=float(np.median(warm[-tenth:]) - np.median(warm[:tenth])),
         cpu=(_cpu_s(runtime.pid) - cpu_s) / wall_s,
+        stolen=(_processors()[1] - stolen) / max(_processors()[0] - wanted, 1),
     )
 
 
@@ -185,3 +193,10 @@ def _cpu_s(pid: int) -> float:
     """Time that a process has spent on processors."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _processors() -> tuple[int, int]:
+    """Time (clock ticks) that processes wanted all processors, and of it what the host took."""
+    line = Path("/proc/stat").read_text().splitlines()[0].split()
+    user, nice, system, _, _, irq, soft, steal = (int(field) for field in line[1:9])
+    return user + nice + system + irq + soft + steal, steal

@@ -48,7 +48,7 @@ def test_robots_are_set_down_beside_the_drive() -> None:
     spot = (cells[0] + 0.5) * world.resolution_m + np.array(world.origin_m)
     drive = np.tile([*spot, 0.3], (100, 1))
     for _ in range(5):
-        at, start = join._beside(world, drive, rng)
+        at, start = join._beside(world, place.batch, drive, rng)
         assert 0 <= at < 100 - join.LEFT_STEPS
         assert math.dist(start[:2], spot) == pytest.approx(OFF_M)
         assert abs(start[2] - 0.3) == pytest.approx(OFF_RAD)
