@@ -8,8 +8,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from cbe.errors import RouteError
-from cbe_runtime import drawing, facts, forecast, lint, routefile
+from cbe_runtime import drawing, facts, footage, forecast, lint, routefile
 from cbe_runtime import options as shared
 from cbe_runtime.drive import RecordedDrive
 from cbe_runtime.networks import Networks
@@ -48,6 +50,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     join.add_argument("a", type=Path)
     join.add_argument("b", type=Path)
     join.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.msgpack")
+
+    frames = add("frames", "Write a drive's views and odometry for cbe-train --footage", _frames)
+    frames.add_argument("drive", type=Path, help="MCAP file with a camera and odometry")
+    frames.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.npz")
+    frames.add_argument("--topic", help="camera topic of the recording, where it has several")
+    shared.add_camera(frames)
 
     reverse = add("reverse", "Refused, with the reason", _reverse)
     reverse.add_argument("route", type=Path)
@@ -131,6 +139,15 @@ def _join(options: argparse.Namespace) -> int:
     sys.stdout.write(
         f"{options.output}: {size} bytes, {joined.steps} steps in {len(joined.segments)} segments\n"
     )
+    return 0
+
+
+def _frames(options: argparse.Namespace) -> int:
+    camera = shared.read_camera(options.camera)
+    views, poses = footage.extract(RecordedDrive.open(options.drive, options.topic, camera))
+    size = footage.save(options.output, views, poses)
+    driven_m = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
+    sys.stdout.write(f"{options.output}: {size} bytes, {len(views)} frames, {driven_m:.1f} m\n")
     return 0
 
 

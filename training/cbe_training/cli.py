@@ -13,7 +13,7 @@ import torch
 from cbe.errors import CbeError
 from cbe_training import team
 from cbe_training.checkpoint import pack
-from cbe_training.config import Learn, TrainConfig
+from cbe_training.config import Learn, Material, TrainConfig
 from cbe_training.train import train
 
 
@@ -39,6 +39,22 @@ def main() -> int:
     )
     parser.add_argument("--seed", type=int, default=0, help="worlds and draws of this run")
     parser.add_argument("--worlds", type=int, default=TrainConfig().worlds)
+    parser.add_argument(
+        "--plan",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="MAP.yaml",
+        help="floor plans (as map_server's) to drive in beside the generated worlds",
+    )
+    parser.add_argument(
+        "--footage",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="DRIVE.npz",
+        help="recorded drives to learn from too, as cbe-route frames writes them",
+    )
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument(
         "--workers", type=int, default=0, help="processes (default: one a core, one with a GPU)"
@@ -67,6 +83,7 @@ def main() -> int:
         what=Learn(arguments.learn),
         decay_hours=arguments.decay_hours,
         bf16=bf16,
+        material=Material(tuple(arguments.plan), tuple(arguments.footage)),
     )
     try:
         if arguments.pack is not None:
@@ -89,7 +106,18 @@ def _work(
     what: Learn,
     decay_hours: float,
     bf16: bool,
+    material: Material,
 ) -> None:
     level = logging.INFO if member.rank == 0 else logging.WARNING
     logging.basicConfig(level=level, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
-    train(config, folder, hours, device, member, what=what, decay_hours=decay_hours, bf16=bf16)
+    train(
+        config,
+        folder,
+        hours,
+        device,
+        member,
+        what=what,
+        decay_hours=decay_hours,
+        bf16=bf16,
+        material=material,
+    )

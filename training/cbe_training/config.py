@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from enum import Enum
+from pathlib import Path
 
 
 class Learn(Enum):
@@ -39,6 +40,17 @@ class LossWeights:
     displacement: float = 0.2  # pose since the start, in every z
     relation: float = 0.3  # relative pose of two views, from their attractors
     views: float = 0.5  # the same, of views that are not a rollout's
+
+
+@dataclass(frozen=True, slots=True)
+class Material:
+    """What else is learnt from: floor plans (YAML) and recorded drives (.npz)."""
+
+    plans: tuple[Path, ...] = ()
+    footage: tuple[Path, ...] = ()
+
+
+NOTHING_ELSE = Material()
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 import hashlib
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from cbe.robot import Robot
 from cbe_hil_sim.clearance import Clearance
 from cbe_hil_sim.demonstrator import demonstrate, sample_routes
+from cbe_hil_sim.floorplan import from_floorplan
 from cbe_hil_sim.generate import VALIDATION_SEEDS, generate
 from cbe_hil_sim.world import BIN_SIZE_M, World
 from cbe_hil_sim.worldbatch import WorldBatch
@@ -21,6 +23,8 @@ BIN_RADIUS_M, BIN_HEIGHT_M = 0.5 * BIN_SIZE_M[0], BIN_SIZE_M[2]
 BIN_ASIDE_M = 0.3  # of a drive, at most
 BIN_PASS_M = 0.6  # left free on one side at least
 BINS_APART_M = 2.0
+LOOKS = 4  # of each floor plan
+_PLAN_SEEDS = 1_000_000  # of the drives on floor plans: beyond all worlds' seeds
 _WORLDS_AT_ONCE = 8  # driven in one lock-step batch
 
 logger = logging.getLogger(__name__)
@@ -40,12 +44,15 @@ class Drives:
     poses: list[NDArray[np.float64]]
 
     @classmethod
-    def build(cls, seeds: range, per_world: int, cache: Path) -> "Drives":
-        """Generate the worlds of `seeds` and drive through each `per_world` times.
+    def build(
+        cls, seeds: Sequence[int], per_world: int, cache: Path, plans: Sequence[World] = ()
+    ) -> "Drives":
+        """Generate the worlds of `seeds` and drive through these and `plans` `per_world` times.
 
         The poses are kept in `cache`, since driving takes longer than generating.
         """
-        worlds = [generate(seed) for seed in seeds]
+        worlds = [*(generate(seed) for seed in seeds), *plans]
+        seeds = [*seeds, *range(_PLAN_SEEDS, _PLAN_SEEDS + len(plans))]
         logger.info("generated %d worlds", len(worlds))
         path = cache / cache_name(worlds, per_world)
         if path.exists():
@@ -65,6 +72,15 @@ class Drives:
             for index, (each, seed) in enumerate(zip(worlds, seeds, strict=True))
         ]
         return cls(WorldBatch.pack(both), len(worlds), Clearance(both), world, list(poses))
+
+
+def furnished(plans: Sequence[Path]) -> list[World]:
+    """Worlds on the floor plans (map_server's YAML files) at these paths, each in several looks.
+
+    Raises:
+        WorldError: a plan cannot be read.
+    """
+    return [from_floorplan(plan, seed=look) for plan in plans for look in range(LOOKS)]
 
 
 def unseen(worlds: int, per_world: int, cache: Path) -> Drives:
@@ -100,7 +116,7 @@ def _with_bins(world: World, drives: list[NDArray[np.float64]], seed: int) -> Wo
 
 
 def _drive(
-    worlds: list[World], seeds: range, per_world: int
+    worlds: list[World], seeds: Sequence[int], per_world: int
 ) -> tuple[NDArray[np.int64], list[NDArray[np.float64]]]:
     """Drive `per_world` routes in every world: world indices (N,) and poses."""
     robot = Robot()

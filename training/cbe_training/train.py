@@ -8,6 +8,7 @@ import ctypes
 import logging
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +16,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cbe.errors import ConfigError
 from cbe_hil_sim.generate import TRAIN_SEEDS
 from cbe_training import losses, views
 from cbe_training.checkpoint import Learner
-from cbe_training.config import Learn, TrainConfig
+from cbe_training.config import NOTHING_ELSE, Learn, Material, TrainConfig
 from cbe_training.curve import STEPS, Curve
-from cbe_training.drives import Drives, unseen
+from cbe_training.drives import Drives, furnished, unseen
+from cbe_training.footage import Footage, retell
 from cbe_training.networks import BehaviorNetworks
 from cbe_training.rollout import Behaviors, Rollouts, roll_out, show
 from cbe_training.team import Team
@@ -43,11 +46,17 @@ def train(
     what: Learn = Learn.ALL,
     decay_hours: float = 0.0,
     bf16: bool = False,
+    material: Material = NOTHING_ELSE,
 ) -> None:
     """Train for `hours` more, the learning rate falling to nothing over the last `decay_hours`.
 
     Every worker of the team calls this with the same arguments.
+
+    Raises:
+        ConfigError: footage is given where the convolutions are not learnt.
     """
+    if material.footage and what is not Learn.ALL:
+        raise ConfigError(f"footage is learnt from with --learn all; found --learn {what.value}")
     _keep_freed_memory()
     learner = Learner(config, device, bf16=bf16)
     if (folder / "state.json").exists():
@@ -56,7 +65,9 @@ def train(
     cache = folder.parent / "drives"
     first = config.seed * config.worlds
     seeds = TRAIN_SEEDS[first : first + config.worlds][team.rank :: team.size]
-    drives = Drives.build(seeds, config.drives_per_world, cache)
+    plans = furnished(material.plans)[team.rank :: team.size]
+    drives = Drives.build(seeds, config.drives_per_world, cache, plans)
+    footage = [Footage.load(path) for path in material.footage]
     validation = unseen(VALIDATION_WORLDS, VALIDATION_DRIVES, cache)
     start, saved = time.monotonic(), time.monotonic()
     before = learner.seconds
@@ -64,7 +75,7 @@ def train(
     while (elapsed := team.latest(time.monotonic() - start)) < hours * 3600.0:
         left = hours * 3600.0 - elapsed
         decay = min(1.0, left / (decay_hours * 3600.0)) if decay_hours > 0.0 else 1.0
-        row = iterate(learner, drives, decay, team, what)
+        row = iterate(learner, drives, decay, team, what, footage)
         learner.iteration += 1
         learner.seconds = before + elapsed
         if what is not Learn.VIEWS and learner.iteration % config.validation_every == 0:
@@ -84,7 +95,12 @@ def train(
 
 
 def iterate(
-    learner: Learner, drives: Drives, decay: float, team: Team, what: Learn = Learn.ALL
+    learner: Learner,
+    drives: Drives,
+    decay: float,
+    team: Team,
+    what: Learn = Learn.ALL,
+    footage: Sequence[Footage] = (),
 ) -> dict[str, float]:
     """One iteration: roll out behaviors, then take a few updates on them; the mean losses."""
     config, iteration = learner.config, learner.iteration
@@ -115,6 +131,11 @@ def iterate(
         for _ in range(config.epochs):
             for chosen in _minibatches(rollouts, config.minibatch // team.size, rng):
                 lessons.append((behaviors, rollouts, chosen))
+    if footage:
+        count = config.demonstrations // team.size // 3
+        told = retell(footage, count, frames[0], USUAL_GAP, config, rng)
+        for chosen in _minibatches(told[1], config.minibatch // team.size, rng):
+            lessons.append((*told, chosen))
     rolled = time.monotonic()
     for index in together.permutation(len(lessons)):
         behaviors, rollouts, chosen = lessons[index]
