@@ -1,5 +1,8 @@
-"""Starts beside a demonstration's own, drawn and kept as the paper's evaluation does (facts of
-its public implementation: offsets, the swollen body, the overlap of the two views)."""
+"""Starts beside a demonstration's own, drawn and kept as the paper's evaluation does.
+
+The offsets, the swollen body and the overlap of both views are those of its public code; it drives
+on from the demonstration's own start where five draws fail, here another drive is taken.
+"""
 
 import math
 

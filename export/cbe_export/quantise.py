@@ -1,6 +1,5 @@
 """Static 8-bit quantisation (QDQ) of exported graphs, calibrated on rollouts."""
 
-import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -51,7 +50,6 @@ def quantise(networks: BehaviorNetworks, folder: Path, rides: Rides) -> None:
     sessions = {name: _Recorder(folder / f"{name}.onnx") for name in (*GRAPHS, "shape")}
     for images, frames, shown in zip(rides.images, rides.frames, rides.shown, strict=True):
         replay(networks, sessions, images[:frames], shown)
-    logging.getLogger().setLevel(logging.ERROR)  # it warns of what it was told
     for name in GRAPHS:
         path = folder / f"{name}.onnx"
         model = onnx.load(path)
