@@ -22,7 +22,7 @@ from cbe_bench.demo_processes import Child, Crew, free_port
 from cbe_bench.demo_report import Report
 from cbe_bench.demo_stage import DemoConfig, Stage
 from cbe_bench.demo_witness import Witness
-from cbe_hil_sim.generate import TEST_SEEDS, generate
+from cbe_hil_sim.generate import TEST_HOUSES, generate
 from cbe_runtime import routefile
 
 if TYPE_CHECKING:
@@ -39,8 +39,8 @@ def main(arguments: list[str] | None = None) -> int:
     config = DemoConfig(
         options.seed, options.scene, options.obstacle, options.fast, options.out, options.model
     )
-    if config.seed not in range(len(TEST_SEEDS)):
-        sys.stderr.write(f"demo: --seed must be 0 to {len(TEST_SEEDS) - 1}; found {config.seed}\n")
+    if config.seed not in range(len(TEST_HOUSES)):
+        sys.stderr.write(f"demo: --seed must be 0 to {len(TEST_HOUSES) - 1}; found {config.seed}\n")
         return 2
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
@@ -92,7 +92,7 @@ def run(config: DemoConfig) -> bool:
 def _world(config: DemoConfig) -> World:
     """What to plan in: an unseen generated house, or a scene's free space."""
     if config.scene is None:
-        return generate(TEST_SEEDS[config.seed])
+        return generate(TEST_HOUSES[config.seed])
     from cbe_hil_sim.meshscene import load_scene
 
     return load_scene(config.scene).planning
@@ -102,7 +102,7 @@ def _sim_options(config: DemoConfig, course: Course) -> list[str]:
     # From the drive's own start: what is recorded before it shows the same place.
     options = ["--start=" + ",".join(f"{value:.6f}" for value in course.start)]
     if config.scene is None:
-        options += ["--world", str(TEST_SEEDS[config.seed])]
+        options += ["--world", str(TEST_HOUSES[config.seed])]
     else:
         options += ["--scene", str(config.scene)]
     if importlib.util.find_spec("pybullet") is None:

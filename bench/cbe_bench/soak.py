@@ -18,7 +18,7 @@ from cbe_bench.demo_course import choose
 from cbe_bench.demo_processes import Child, Crew, ProcessError, free_port
 from cbe_bench.demo_stage import DemoConfig, Stage
 from cbe_bench.demo_witness import Witness
-from cbe_hil_sim.generate import TEST_SEEDS, generate
+from cbe_hil_sim.generate import TEST_HOUSES, generate
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -100,12 +100,12 @@ def run(minutes: float, seed: int, model: Path | None, note: Callable[[str], Non
     Raises:
         CbeError: a part refused to work, or ended.
     """
-    course = choose(generate(TEST_SEEDS[seed]), seed)
+    course = choose(generate(TEST_HOUSES[seed]), seed)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with tempfile.TemporaryDirectory() as folder, Crew(Path(folder)) as crew:
         config = DemoConfig(seed, None, False, False, Path(folder), model)
         sim = crew.start(
-            "cbe-sim", "--backend", "column", "--world", str(TEST_SEEDS[seed]),
+            "cbe-sim", "--backend", "column", "--world", str(TEST_HOUSES[seed]),
             "--listen", endpoint, "--start=" + ",".join(f"{value:.6f}" for value in course.start),
         )  # fmt: skip
         with _connected(endpoint, sim) as link:

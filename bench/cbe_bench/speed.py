@@ -17,7 +17,7 @@ from cbe.controller import Motion, RmpController
 from cbe.robot import STEP_S, Robot
 from cbe_bench import authors
 from cbe_hil_sim.demonstrator import ENDPOINT_CLEARANCE_M
-from cbe_hil_sim.generate import TEST_SEEDS, generate
+from cbe_hil_sim.generate import TEST_HOUSES, generate
 from cbe_hil_sim.render import render
 from cbe_hil_sim.scanner import scan
 from cbe_hil_sim.worldbatch import WorldBatch
@@ -70,7 +70,7 @@ def measure(config: SpeedConfig, say: Callable[[str], None]) -> dict[str, Any]:
 def _worlds(renders: int, blocks: int) -> dict[str, Any]:
     """Frames (64x64, 2x2 rays a pixel) and scans a second in furnished worlds."""
     batch_size = 64
-    worlds = [generate(seed) for seed in TEST_SEEDS[:4]]
+    worlds = [generate(seed) for seed in TEST_HOUSES[:4]]
     batch = WorldBatch.pack(worlds)
     rng = np.random.default_rng(0)
     where = rng.integers(0, len(worlds), batch_size)

@@ -44,6 +44,10 @@ def is_hall(seed: int) -> bool:
     return seed % HALL_EVERY == HALL_EVERY - 1
 
 
+TEST_HOUSES = [seed for seed in TEST_SEEDS if not is_hall(seed)]
+"""Test worlds of many rooms, with ways through several doors."""
+
+
 def generate(seed: int) -> World:
     """Build the world of `seed`, the same one each time; all its floor is reachable.
 

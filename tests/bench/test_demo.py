@@ -9,14 +9,14 @@ from cbe_bench import demo_course
 from cbe_bench.demo_processes import Crew, OverdueError
 from cbe_bench.demo_report import ARRIVED, Drive, Repetition, Report
 from cbe_bench.demo_witness import Truth, Witness, along
-from cbe_hil_sim.generate import TEST_SEEDS, generate
+from cbe_hil_sim.generate import TEST_HOUSES, generate
 
 SEEDS = (1, 2, 3)
 
 
 @pytest.fixture(scope="module", params=SEEDS)
 def house(request):
-    world = generate(TEST_SEEDS[request.param])
+    world = generate(TEST_HOUSES[request.param])
     return world, demo_course.choose(world, request.param), request.param
 
 

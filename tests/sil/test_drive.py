@@ -13,7 +13,7 @@ from cbe_hil_sim.demonstrator import sample_routes
 from cbe_hil_sim.generate import TEST_SEEDS, generate
 from cbe_runtime.networks import PACKAGED_MODELS
 
-WORLD_SEED = TEST_SEEDS[3]
+WORLD_SEED = TEST_SEEDS[4]
 CALL_S = 60.0  # for what takes a moment on an idle machine
 SUCCESS_M, SUCCESS_RAD = 0.5, math.radians(30.0)
 
