@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cbe.camera import MODEL_CAMERA
+from cbe.geometry import wrap_angle
 from cbe.robot import Robot
 from cbe_hil_sim.march import scan_rays
 from cbe_hil_sim.world import World
@@ -91,8 +92,7 @@ def _seen(batch: WorldBatch, one: NDArray[np.floating], other: NDArray[np.floati
     bearing = np.arctan2(apart[:, 1], apart[:, 0])
     eyes = np.column_stack([np.broadcast_to(from_other[:2], apart.shape), bearing])
     free_m = _cast(batch, eyes, np.zeros(1))[:, 0]
-    turn = np.remainder(bearing - from_other[2] + np.pi, 2.0 * np.pi) - np.pi
-    inside = np.abs(turn) <= angles_rad[0] + 1e-6
+    inside = np.abs(wrap_angle(bearing - from_other[2])) <= angles_rad[0] + 1e-6
     return float(np.mean(inside & (np.hypot(*apart.T) < free_m)))
 
 

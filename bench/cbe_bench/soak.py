@@ -143,6 +143,7 @@ def _soak(link: Link, runtime: Child, course: Course, duration_s: float) -> Soak
         if newest is not None and newest.message is not None:
             status = newest.message
     wall_s = time.monotonic() - began_s
+    then_wanted, then_stolen = _processors()
     warm = rss[int(WARM_SHARE * len(rss)) :]
     tenth = max(len(warm) // 10, 1)
     bounds = status["histograms"]["bounds_ms"]
@@ -158,7 +159,7 @@ def _soak(link: Link, runtime: Child, course: Course, duration_s: float) -> Soak
         rss_mib=max(rss),
         growth_mib=float(np.median(warm[-tenth:]) - np.median(warm[:tenth])),
         cpu=(_cpu_s(runtime.pid) - cpu_s) / wall_s,
-        stolen=(_processors()[1] - stolen) / max(_processors()[0] - wanted, 1),
+        stolen=(then_stolen - stolen) / max(then_wanted - wanted, 1),
     )
 
 

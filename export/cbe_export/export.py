@@ -17,7 +17,7 @@ from cbe.errors import ModelError
 from cbe_export.graphs import ticks
 from cbe_export.parity import Rides, worst_difference
 from cbe_export.quantise import quantise
-from cbe_export.storing import store_in_half, strip
+from cbe_export.storing import save
 from cbe_training.checkpoint import load_networks
 from cbe_training.networks import BehaviorNetworks
 
@@ -137,10 +137,5 @@ def write_graphs(
                 external_data=False,
                 verbose=False,
             )
-        model = onnx.load(path)
-        store_in_half(model)
-        strip(model.graph)
-        onnx.helper.set_model_props(model, metadata)
-        onnx.checker.check_model(model, full_check=True)
-        onnx.save(model, path)
+        save(onnx.load(path), path, metadata)
     return model_id

@@ -9,7 +9,7 @@ import onnxruntime
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 
 from cbe_export.parity import Arrays, Rides, replay
-from cbe_export.storing import restore_from_half, store_in_half, strip
+from cbe_export.storing import restore_from_half, save
 from cbe_training.networks import BehaviorNetworks
 
 GRAPHS = ("encoder", "attractor", "generator")
@@ -66,9 +66,4 @@ def quantise(networks: BehaviorNetworks, folder: Path, rides: Rides) -> None:
             activation_type=QuantType.QUInt8,
             weight_type=QuantType.QInt8,
         )
-        model = onnx.load(path)
-        store_in_half(model)
-        strip(model.graph)
-        onnx.helper.set_model_props(model, metadata)
-        onnx.checker.check_model(model, full_check=True)
-        onnx.save(model, path)
+        save(onnx.load(path), path, metadata)

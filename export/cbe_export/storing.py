@@ -1,10 +1,21 @@
 """How graphs are stored: large weights in half precision, nothing of the code they came from."""
 
+from pathlib import Path
+
 import numpy as np
 import onnx
 import onnx.numpy_helper
 
 LARGE = 1024  # numbers: smaller tensors are not worth a node
+
+
+def save(model: onnx.ModelProto, path: Path, metadata: dict[str, str]) -> None:
+    """Check a graph and write it, small and with the metadata that the runtime reads."""
+    store_in_half(model)
+    strip(model.graph)
+    onnx.helper.set_model_props(model, metadata)
+    onnx.checker.check_model(model, full_check=True)
+    onnx.save(model, path)
 
 
 def strip(graph: onnx.GraphProto) -> None:

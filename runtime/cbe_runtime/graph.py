@@ -20,7 +20,7 @@ _TYPES = {"tensor(float)": np.float32, "tensor(uint8)": np.uint8}
 class Graph:
     """A session with its inputs and outputs in memory of its own; for one thread at a time.
 
-    To hand arrays over anew each tick took an eighth of it.
+    To hand arrays over anew each tick took a twelfth of it.
     """
 
     def __init__(self, session: ort.InferenceSession, name: str) -> None:

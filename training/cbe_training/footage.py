@@ -71,29 +71,24 @@ def retell(
     paths = track.Paths.build(pieces)
     cameras = appearance.sample(rng, count, Robot().camera_height_m)
 
-    def look(rows: NDArray[np.intp], late: NDArray[np.int64]) -> list[NDArray[np.uint8]]:
-        return [
-            chosen[row].views[first[row] + by : first[row] + by + steps : gap]
-            for row, by in zip(rows.tolist(), late.tolist(), strict=True)
-        ]
-
     def film(views: list[NDArray[np.uint8]], through: appearance.Appearance) -> NDArray[np.uint8]:
         every = np.repeat(np.arange(len(views)), frames)
         seen = appearance.apply(through.take(every), np.concatenate(views), rng)
         return seen.reshape(len(views), frames, *VIEW)
 
     rows = np.arange(count)
-    images = film(look(rows, np.zeros(count, np.int64)), cameras)
+    shown = [each.views[at : at + steps : gap] for each, at in zip(chosen, first, strict=True)]
+    images = film(shown, cameras)
     behaviors = Behaviors(paths, rows, cameras, images, paths.poses[:, ::gap], gap, 1)
     driven = np.repeat(rows, config.repeats)
     late = rng.integers(0, gap, len(driven))
-    poses = np.stack(
-        [
-            chosen[row].poses[first[row] + by : first[row] + by + steps : gap]
-            for row, by in zip(driven.tolist(), late.tolist(), strict=True)
-        ]
-    )
-    seen = film(look(driven, late), appearance.vary(rng, cameras.take(driven)))
+    again = [
+        (chosen[row], slice(first[row] + by, first[row] + by + steps, gap))
+        for row, by in zip(driven.tolist(), late.tolist(), strict=True)
+    ]
+    poses = np.stack([each.poses[span] for each, span in again])
+    views = [each.views[span] for each, span in again]
+    seen = film(views, appearance.vary(rng, cameras.take(driven)))
     waypoints, progress = np.zeros((*poses.shape[:2], 2)), np.zeros(poses.shape[:2])
     last = np.zeros(len(driven), np.int64)
     taken = paths.take(driven)
