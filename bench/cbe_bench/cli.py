@@ -39,6 +39,7 @@ def _parser() -> argparse.ArgumentParser:
     single = commands.add_parser("single", help="repeat single behaviors in many worlds")
     single.add_argument("--steps", type=int, default=128, help="length, 0.1 s each (%(default)s)")
     shared.add_behaviors(single)
+    shared.add_precision(single)
     single.add_argument("--plot", type=Path, metavar="FILE", help="write a sheet of traces")
     single.set_defaults(run=_single)
 
@@ -142,8 +143,11 @@ def _parser() -> argparse.ArgumentParser:
 
 def _single(options: argparse.Namespace) -> None:
     from cbe_bench import single
+    from cbe_bench.route import precision_of
 
-    _report(options, single.run(shared.behaviors(options, options.steps)), f"{options.steps} steps")
+    behaviors, precision = shared.behaviors(options, options.steps), precision_of(options.precision)
+    done = single.run(behaviors, precision=precision)
+    _report(options, done, f"{options.steps} steps")
 
 
 def _route(options: argparse.Namespace) -> None:

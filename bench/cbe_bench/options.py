@@ -69,14 +69,19 @@ def add_teaching(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--segment-steps", type=int, metavar="K", help="longest segment (the model's own)"
     )
+    add_precision(parser)
+    parser.add_argument(
+        "--adaptive", action="store_true",
+        help="put joints where the view pins the place best, in place of equal segments",
+    )  # fmt: skip
+
+
+def add_precision(parser: argparse.ArgumentParser) -> None:
+    """How exactly drives are stored."""
     parser.add_argument(
         "--precision", type=AttractorPrecision, choices=list(AttractorPrecision),
         default=AttractorPrecision.U8, metavar="f32|u8|u4",
         help="of attractors; with f32 embeddings are f32 too, else f16 (%(default)s)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--adaptive", action="store_true",
-        help="put joints where the view pins the place best, in place of equal segments",
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ Batch 1, one tick, every recurrent state explicit (paper, Sec. III-B to III-D).
 
 from dataclasses import dataclass
 
-CONTRACT_VERSION = 1
+CONTRACT_VERSION = 2
 
 IMAGE_SIZE = 64
 FEATURES = (32, 16, 16)
@@ -74,7 +74,8 @@ def attractor() -> Graph:
 def generator(state_size: int) -> Graph:
     """Waypoint generator: `waypoint_m` is x, y in base_link; progress runs 0 to 1.
 
-    `on_route` is the probability of being within 1 m of the demonstration.
+    `on_route` is the probability of being within 1 m of the demonstration. `end` is x, y, cos, sin
+    of the behavior's last pose in base_link, as far as `attractor_now` shows it.
     """
     state = (1, state_size)
     attractors = ("attractor_now", "attractor_first", "attractor_start", "attractor_goal")
@@ -91,6 +92,7 @@ def generator(state_size: int) -> Graph:
             Tensor("waypoint_m", (1, 2)),
             Tensor("progress", (1,)),
             Tensor("on_route", (1,)),
+            Tensor("end", (1, 4)),
             Tensor("h_next", state),
             Tensor("c_next", state),
         ),

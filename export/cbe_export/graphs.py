@@ -137,7 +137,7 @@ class GeneratorTick(nn.Module):
         embedding_goal: Tensor,
         h: Tensor,
         c: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, ...]:
         """See `cbe.signature.generator`."""
         sizes = [1, *(math.prod(shape) for shape in self.shapes)]
         kept_size = sum(sizes)
@@ -156,7 +156,8 @@ class GeneratorTick(nn.Module):
         h, c = self.lstm(inputs, h, c)
         out = self.generator.out(self.generator.head(torch.cat([h, inputs], dim=1)))  # (1, 4)
         h, c = torch.cat([h, kept], dim=1), torch.cat([c, spare], dim=1)
-        return out[:, :2], out[:, 2], torch.sigmoid(out[:, 3]), h, c
+        end = self.generator.guide.seen(to_goal)
+        return out[:, :2], out[:, 2], torch.sigmoid(out[:, 3]), end, h, c
 
     def _remember(self, first: Tensor, start: Tensor, embedding_goal: Tensor) -> Tensor:
         """One, for known, and then all that is `Remembered`."""

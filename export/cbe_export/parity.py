@@ -77,7 +77,7 @@ def _run_torch(
     images: NDArray[np.uint8],
     shown: NDArray[np.uint8],
 ) -> NDArray[np.float32]:
-    """Waypoint, progress, on_route, embedding and its path (T, 52), the sequence at once."""
+    """Waypoint, progress, on_route, end, embedding and its path (T, 56), the sequence at once."""
 
     def look(frames: NDArray[np.uint8]) -> tuple[Tensor, Tensor]:
         features = networks.trunk(torch.from_numpy(frames))
@@ -90,7 +90,8 @@ def _run_torch(
     to_goal = relation(attractor, goal[-1:].expand(len(images), -1))[None]
     to_start = relation(attractor[:1], goal[:1])[None]
     out = networks.generator(to_goal, to_start, z, goal_z[:, -1:])
-    parts = [out.waypoint_m, out.progress[..., None], torch.sigmoid(out.on_route_logit)[..., None]]
+    on_route, end = torch.sigmoid(out.on_route_logit), networks.generator.guide.seen(to_goal)
+    parts = [out.waypoint_m, out.progress[..., None], on_route[..., None], end]
     paths = path_of(z, signature.SHAPE_POINTS).flatten(-2)
     return torch.cat([*parts, z, paths], dim=-1)[0].numpy()
 
@@ -101,7 +102,7 @@ def replay(
     images: NDArray[np.uint8],
     shown: NDArray[np.uint8],
 ) -> NDArray[np.float32]:
-    """The same (T, 52) as onnxruntime has it, tick by tick.
+    """The same (T, 56) as onnxruntime has it, tick by tick.
 
     Of images (T, 64, 64, 3) of a repetition, and `shown` those of the demonstration.
     """
@@ -133,8 +134,8 @@ def replay(
         state |= {"attractor_now": now["attractor"], "embedding_now": now["embedding"]}
         out = _call(sessions["generator"], state)
         state |= {"h": out["h_next"], "c": out["c_next"]}
-        parts = [out["waypoint_m"][0], out["progress"], out["on_route"], now["embedding"][0]]
-        rows.append(np.concatenate([*parts, now["path_m"].reshape(-1)]))
+        parts = [out["waypoint_m"][0], out["progress"], out["on_route"], out["end"][0]]
+        rows.append(np.concatenate([*parts, now["embedding"][0], now["path_m"].reshape(-1)]))
     return np.stack(rows)
 
 

@@ -30,12 +30,14 @@ class Behavior:
         self.last = segment + 1 == len(route.segments)
 
     @property
-    def unlike_goal(self) -> float:
-        """How unlike its end the last view is, as `likeness.unlikeness`; 0 where that is unknown.
+    def pinned(self) -> bool:
+        """Whether its end is remembered by its view; a memory without attractors holds zeros."""
+        return bool(self._goal.any())
 
-        A memory without attractors holds zeros in their place.
-        """
-        if self.sight is None or not self._goal.any():
+    @property
+    def unlike_goal(self) -> float:
+        """How unlike its end the last view is, as `likeness.unlikeness`; 0 if unknown."""
+        if self.sight is None or not self.pinned:
             return 0.0
         return float(unlikeness(self.sight.attractor, self._goal))
 

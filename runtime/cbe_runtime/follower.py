@@ -11,6 +11,7 @@ import numpy as np
 
 from cbe.controller import Motion, RmpController, twist
 from cbe.errors import ModelError
+from cbe.parking import REACH_M, Parking
 from cbe.robot import STEP_S, Robot
 from cbe.signature import OVERRUN_M
 from cbe.stop_zone import limit
@@ -29,9 +30,6 @@ if TYPE_CHECKING:
     from cbe_runtime.networks import Networks, Prediction
     from cbe_runtime.observation import Frame
     from cbe_runtime.route import Route
-
-ARRIVED_RANGE_M = 0.03
-"""Nearer than this the end counts as reached: below the stopping jerk of one step."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +124,7 @@ class Follower:
         self._robot = robot or Robot()
         self._config = config or FollowerConfig()
         self._controller = RmpController(self._robot)
+        self._parking = Parking(self._robot)
         self._camera_watch = StampWatch(
             self._config.fresh_s, Reason.STALE_CAMERA, Reason.FROZEN_CAMERA
         )
@@ -148,6 +147,7 @@ class Follower:
         self._seen_stamp_ns: int | None = None
         self._prediction: Prediction | None = None
         self._waypoint_m: tuple[float, float] | None = None  # at the present pose
+        self._rest = np.zeros(3)  # where ARRIVED comes to stand, likewise
 
     @property
     def model_id(self) -> str:
@@ -288,13 +288,24 @@ class Follower:
         self._done_ticks = self._done_ticks + 1 if done else 0
         if self._done_ticks < self._config.progress_ticks:
             return
-        as_remembered = self._behavior.unlike_goal <= self._config.lost.unlike_end
+        rest = self._end(prediction)
+        near = math.hypot(rest[0], rest[1]) <= REACH_M
+        as_remembered = near and self._behavior.unlike_goal <= self._config.lost.unlike_end
         if not as_remembered:
             self._belief.contradict()
         if not last:
             self._begin(self._behavior.segment + 1)
         elif as_remembered:
             self._machine.update(Events(arrived=True))
+            self._rest, self._waypoint_m = rest, (float(rest[0]), float(rest[1]))
+
+    def _end(self, prediction: Prediction) -> NDArray[np.float64]:
+        """The behavior's last pose (3,) in base_link, as the view shows it."""
+        if self._behavior.pinned:
+            x, y, cos, sin = prediction.end
+            return np.array([x, y, math.atan2(sin, cos)])
+        x, y = prediction.waypoint_m  # nothing else tells
+        return np.array([x - OVERRUN_M, y, 0.0])
 
     def _lose(self) -> None:
         """Stand, and look for the place."""
@@ -371,11 +382,12 @@ class Follower:
             self._command = (0.0, 0.0)
         else:
             scan_m = ranges_m[None]  # (1, rays)
-            goal_m = np.array([self._waypoint_m])  # (1, 2)
-            motion = self._controller.step(self._motion, goal_m, scan_m)
             if state is State.ARRIVED:
-                motion = self._coast(motion)
-            elif state is State.JOINING:
+                motion = self._parking.step(self._motion, self._rest)
+            else:
+                goal_m = np.array([self._waypoint_m])  # (1, 2)
+                motion = self._controller.step(self._motion, goal_m, scan_m)
+            if state is State.JOINING:
                 creep_mps = np.minimum(motion.speed_mps, self._config.join.creep_mps)
                 motion = Motion(creep_mps, motion.steer_rad)
             age_s = max(self._camera_watch.age_s(now_s), self._scan_watch.age_s(now_s))
@@ -385,16 +397,8 @@ class Follower:
             speed, yaw_rate = twist(self._motion, self._robot)
             self._command = (float(speed[0]), float(yaw_rate[0]))
 
-    def _coast(self, motion: Motion) -> Motion:
-        """Come to rest at the end: never faster than before, nor than can be braked."""
-        assert self._waypoint_m is not None
-        ahead_m = self._waypoint_m[0] - OVERRUN_M - ARRIVED_RANGE_M
-        cap = math.sqrt(2.0 * self._robot.max_braking_mps2 * ahead_m) if ahead_m > 0.0 else 0.0
-        speed = np.minimum(motion.speed_mps, np.minimum(self._motion.speed_mps, cap))
-        return Motion(speed, motion.steer_rad)
-
     def _carry_waypoint(self) -> None:
-        """Express the held waypoint at the present pose, dead-reckoned over the step gone by."""
+        """Express waypoint and rest at the present pose, dead-reckoned over the step gone by."""
         if self._waypoint_m is None:
             return
         speed, yaw_rate = twist(self._motion, self._robot)
@@ -404,6 +408,8 @@ class Follower:
         y = self._waypoint_m[1] - travel_m * math.sin(0.5 * turn_rad)
         cos, sin = math.cos(turn_rad), math.sin(turn_rad)
         self._waypoint_m = (cos * x + sin * y, cos * y - sin * x)
+        if self._machine.state is State.ARRIVED:
+            self._rest = np.array([*self._waypoint_m, self._rest[2] - turn_rad])
 
     def _decision(self, observation: Observation, now_s: float, ticked: bool) -> Decision:
         frame, scan = observation.frame, observation.scan

@@ -56,12 +56,15 @@ class Prediction:
     """One tick of the generator.
 
     `waypoint_m` (2,) float64 in base_link; `progress` from 0 to 1 over the behavior (not
-    clipped); `on_route` the probability of being within 1 m of the demonstration.
+    clipped); `on_route` the probability of being within 1 m of the demonstration. `end` (4,)
+    float64 is x, y in m, cos and sin of the behavior's last pose in base_link as the view shows
+    it: precise (0.1 m, 2 deg) near the end, anything where the end is out of sight.
     """
 
     waypoint_m: NDArray[np.float64]
     progress: float
     on_route: float
+    end: NDArray[np.float64]
 
 
 class Networks:
@@ -204,7 +207,7 @@ class Networks:
         Raises:
             ModelError: an output is not finite.
         """
-        waypoint_m, progress, on_route, h, c = self._generator.run(
+        waypoint_m, progress, on_route, end, h, c = self._generator.run(
             {
                 "attractor_now": attractor_now[None],
                 "attractor_first": attractor_first[None],
@@ -217,6 +220,9 @@ class Networks:
             },
         )
         prediction = Prediction(
-            waypoint_m[0].astype(np.float64), float(progress[0]), float(on_route[0])
+            waypoint_m[0].astype(np.float64),
+            float(progress[0]),
+            float(on_route[0]),
+            end[0].astype(np.float64),
         )
         return prediction, GeneratorState(h, c)

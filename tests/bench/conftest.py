@@ -41,7 +41,8 @@ class Counting:
         if state == 0:
             self.given.append((bool(attractor_start.any()), bool(attractor_goal.any())))
         progress = 1.0 if state >= self.ticks else 0.0
-        return Prediction(np.array([0.3, 0.0]), progress, self.on_route), state + 1
+        end = np.array([0.0, 0.0, 1.0, 0.0])
+        return Prediction(np.array([0.3, 0.0]), progress, self.on_route, end), state + 1
 
 
 @pytest.fixture

@@ -82,7 +82,8 @@ class StraightOn:
         return np.full(400, 0.5, np.float32)
 
     def generate(self, *, state, **memory):
-        return Prediction(np.array([0.5, 0.0]), self._progress(state), 1.0), state + 1
+        end = np.array([0.2, 0.0, 1.0, 0.0])
+        return Prediction(np.array([0.5, 0.0]), self._progress(state), 1.0, end), state + 1
 
 
 class Blind:

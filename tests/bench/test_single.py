@@ -38,7 +38,8 @@ class StraightOn:
         return np.zeros(400, np.float32)
 
     def generate(self, *, state, **memory):
-        return Prediction(np.array([0.5, 0.0]), 0.1 * state, 1.0), state + 1
+        end = np.array([0.2, 0.0, 1.0, 0.0])
+        return Prediction(np.array([0.5, 0.0]), 0.1 * state, 1.0, end), state + 1
 
 
 @pytest.fixture(autouse=True)
@@ -81,6 +82,17 @@ def test_narrow_camera_sees_enough_to_drive(tmp_path) -> None:
     result = run("single", tmp_path, "--steps", "20", "--episodes", "2", "--camera", "70x55")
     assert result["config"]["camera"] == "70 x 55 deg"
     assert all(ride["steps"] > 0 and ride["outcome"] != "timeout" for ride in result["runs"])
+
+
+@pytest.mark.parametrize("asked", ["f32", "u4"])
+def test_drives_are_stored_as_exactly_as_asked(tmp_path, monkeypatch, asked) -> None:
+    stored, dump = [], evaluation.routefile.dump
+    monkeypatch.setattr(
+        evaluation.routefile, "dump", lambda route: (stored.append(route), dump(route))[1]
+    )
+    options = ("--steps", "20", "--episodes", "2", "--precision", asked)
+    assert run("single", tmp_path, *options)["config"]["precision"] == asked
+    assert [route.precision.attractor.value for route in stored] == [asked] * 2
 
 
 def test_compare_reads_what_single_writes(tmp_path, capsys) -> None:

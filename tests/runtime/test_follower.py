@@ -7,6 +7,7 @@ import pytest
 from cbe.errors import ModelError, RouteError
 from cbe.robot import STEP_S, Robot
 from cbe.signature import OVERRUN_M
+from cbe_runtime.behavior import Behavior
 from cbe_runtime.follower import Follower, FollowerConfig
 from cbe_runtime.networks import Networks
 from cbe_runtime.observation import Frame, Observation, Scan
@@ -144,7 +145,7 @@ def test_stalled_progress_switches_where_the_waypoint_says_rest(drive, monkeypat
     assert drive.step(6).segment == 1
 
 
-def test_arrives_and_comes_to_rest_at_the_last_waypoint(drive):
+def test_arrives_and_comes_to_rest_where_it_sees_the_end(drive):
     for _ in range(2 * 40):
         decision = drive.step()
         if decision.state is State.ARRIVED:
@@ -153,7 +154,8 @@ def test_arrives_and_comes_to_rest_at_the_last_waypoint(drive):
         pytest.fail("never arrived")
     assert decision.segment == 1
     speeds = [decision.speed_mps]
-    x_m, goal_m = 0.0, max(decision.waypoint_m[0] - OVERRUN_M, 0.0)
+    x_m, goal_m = 0.0, decision.waypoint_m[0]
+    assert goal_m > 0.1
     while not decision.standing:
         x_m += decision.speed_mps * STEP_S
         decision = drive.step()
@@ -163,6 +165,32 @@ def test_arrives_and_comes_to_rest_at_the_last_waypoint(drive):
     assert (np.diff(speeds) <= 1e-9).all()
     assert x_m == pytest.approx(goal_m, abs=0.05)
     assert drive.step(5).speed_mps == 0.0
+
+
+def test_end_seen_to_one_side_is_turned_to_though_the_waypoint_is_straight_ahead(
+    drive, monkeypatch
+):
+    end = np.array([0.3, 0.1, np.cos(0.4), np.sin(0.4)])
+    _saying(drive, monkeypatch, progress=1.0, end=end)
+    drive.step()
+    while drive.step().state is not State.ARRIVED:
+        pass
+    decision = drive.step()
+    assert (decision.state, decision.standing) == (State.ARRIVED, False)
+    assert decision.yaw_rate_rad_s > 0.5
+
+
+def test_end_seen_too_far_away_is_no_arrival(drive, monkeypatch):
+    _saying(drive, monkeypatch, progress=1.0, end=np.array([2.0, 0.0, 1.0, 0.0]))
+    states = {drive.step().state for _ in range(40)}
+    assert State.LOST in states
+    assert State.ARRIVED not in states
+
+
+def test_memory_without_attractors_rests_before_the_last_waypoint(drive, monkeypatch):
+    monkeypatch.setattr(Behavior, "pinned", False)
+    _saying(drive, monkeypatch, progress=1.0, end=np.array([2.0, 0.0, 1.0, 0.0]))
+    assert drive.step(6).state is State.ARRIVED
 
 
 def test_start_after_arrival_begins_anew(drive):

@@ -108,7 +108,7 @@ def test_networks_of_two_models_are_refused(tmp_path, model_writer):
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("cbe.contract_version", "2"),
+        ("cbe.contract_version", "1"),
         ("cbe.model_id", "xyz"),
         ("cbe.network_period", "0"),
         ("cbe.network_period", "often"),

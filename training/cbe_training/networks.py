@@ -118,7 +118,7 @@ class Guide(nn.Module):
 
     def remember(self, start_relation: Tensor, embedding_goal: Tensor) -> tuple[Tensor, Tensor]:
         """`Remembered.columns` and `.stride`."""
-        start = layout.frame(self._seen(start_relation))
+        start = layout.frame(self.seen(start_relation))
         columns = layout.from_start(embedding_goal), layout.from_end(embedding_goal)
         length_m = layout.length_m(embedding_goal)
         stride = LOOKAHEAD_M / (length_m + LOOKAHEAD_M)
@@ -128,7 +128,7 @@ class Guide(nn.Module):
         self, goal_relation: Tensor, embedding_now: Tensor, columns: Tensor, stride: Tensor
     ) -> Tensor:
         """As `Generator.forward`, to (B, T, size)."""
-        goal = self._seen(goal_relation)
+        goal = self.seen(goal_relation)
         frames = torch.stack([layout.into(embedding_now), layout.frame(goal)], dim=-3)
         laid = frames[..., :2, :] @ columns  # (B, T, 2, 2, 18)
         ahead, share = self._ahead(laid[..., :PATH_POINTS], stride)
@@ -137,7 +137,7 @@ class Guide(nn.Module):
         read = self.layers(torch.cat([reasons, goal], dim=-1))
         return torch.cat([read, ahead.flatten(-2), share.flatten(-2)], dim=-1)
 
-    def _seen(self, relation: Tensor) -> Tensor:
+    def seen(self, relation: Tensor) -> Tensor:
         """Pose (..., 4: x, y, cos, sin) that a relation shows: of the goal, or of the start."""
         x_y, turn = self.locate(relation).split(2, dim=-1)
         norm = torch.linalg.vector_norm(turn, dim=-1, keepdim=True)

@@ -59,8 +59,8 @@ def run(work: Callable[[Team], None], size: int) -> None:
         return
     # Daemons end with this process; a plain SIGTERM would leave them training on.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-    # Read when a worker starts: set later, some of OpenMP's threads still spin for the cores.
-    os.environ["OMP_NUM_THREADS"] = "1"
+    # Read when a worker starts: set later, or for torch alone, OpenMP's threads spin for the cores.
+    os.environ |= {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as folder:
         arguments = (size, Path(folder) / "meeting", work)
         start_processes(_join, arguments, nprocs=size, daemon=True, start_method="spawn")
