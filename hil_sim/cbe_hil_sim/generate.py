@@ -60,7 +60,7 @@ def generate(seed: int) -> World:
     rng = np.random.default_rng([seed, 7])
     hall = is_hall(seed)
     layout = draw_layout(rng, hall=hall)
-    ceiling_m = rng.uniform(2.5, 7.0) if hall else rng.uniform(2.3, 3.2)
+    ceiling_m = rng.uniform(2.5, 9.0) if hall else rng.uniform(2.3, 3.2)
     builder = Builder(layout, rng, round(float(ceiling_m), 2))
     builder.build()
     return builder.finish(bank(split), f"{layout.style}-{seed}")
@@ -136,23 +136,28 @@ class Builder:
         if rng.random() < 0.4 and min(rect.width, rect.height) > 40:
             rug = self._somewhere(rect, (1.0, 3.2), 4)
             self.floor[rug.slices] = self._fitted(pick(rng, "rug"), rug, look.tint)
-        if self.layout.rooms[index].kind == "hall" and rng.random() < 0.6:
-            self._mark_lanes(rect, look.tint)
+        if self.layout.rooms[index].kind == "hall" and rng.random() < 0.7:
+            self._mark_floor(rect, look.tint)
 
-    def _mark_lanes(self, rect: Rect, light: Tint) -> None:
-        """Paint lines along and across a hall's floor, some of them dashed."""
-        rng = self.rng
-        paint = pick(rng, "plain_ceiling")
-        for _ in range(int(rng.integers(1, 7))):
-            row = self.table.add(paint, (3.0, 3.0), light * colour(rng, (0.0, 0.9)) / 255.0)
-            width = int(rng.integers(1, 4))
-            dash = int(rng.integers(4, 30)) if rng.random() < 0.3 else 0
-            area = self.floor[rect.slices]
-            area = area if rng.random() < 0.5 else area.T
-            at = int(rng.integers(len(area) - width))
-            first, last = np.sort(rng.integers(area.shape[1], size=2))
-            along = np.arange(first, last)
-            area[at : at + width, along[(along // dash) % 2 == 0] if dash else along] = row
+    def _mark_floor(self, rect: Rect, light: Tint) -> None:
+        """Tape outlines onto a hall's floor, of zones and of lanes from wall to wall."""
+        rng, paint = self.rng, pick(self.rng, "plain_ceiling")
+        tapes = [
+            self.table.add(paint, (3.0, 3.0), light * colour(rng, (0.0, 0.9), (0.1, 0.9)) / 255.0)
+            for _ in range(int(rng.integers(1, 4)))
+        ]
+        for _ in range(int(rng.integers(1, 10))):
+            zone = self._somewhere(rect, (0.6, 6.0), 2)
+            if rng.random() < 0.6:
+                x, y = (rect, zone) if rng.random() < 0.5 else (zone, rect)
+                zone = Rect(x.x0, y.y0, x.x1, y.y1)
+            floor, width = self.floor[zone.slices], int(rng.integers(1, 4))
+            taped = np.ones(floor.shape, np.bool_)
+            taped[width:-width, width:-width] = False
+            if rng.random() < 0.4:
+                dash = int(rng.integers(2, 30))
+                taped &= np.indices(floor.shape).sum(axis=0) // dash % 2 == 0
+            floor[taped] = int(rng.choice(tapes))
 
     def _cut(self, opening: Opening, frame: int | None) -> None:
         """Open a wall: free below, a lintel above; each half belongs to the nearer room."""

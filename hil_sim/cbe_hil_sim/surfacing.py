@@ -127,7 +127,18 @@ def draw_looks(rng: Rng, kinds: list[str], style: str) -> list[Look]:
                 shared_light if rng.random() < 0.3 else light(rng),
             )
         )
-    return [_bare(rng, look) for look in looks] if style == "hall" else looks
+    if style == "hall":
+        plain = _white if rng.random() < 0.5 else _bare
+        looks = [plain(rng, look) for look in looks]
+    return looks
+
+
+def _white(rng: Rng, look: Look) -> Look:
+    """A warehouse's look: nearly white from floor to ceiling."""
+    paint = colour(rng, (0.0, 0.06), (0.75, 1.0)).astype(np.float64) / 255.0
+    wall, floor = pick(rng, "plain_ceiling"), pick(rng, "plain_ceiling", "plain_ceiling", "marble")
+    size_m = float(rng.uniform(3.0, 20.0))
+    return replace(look, walls=(wall,) * 4, floor=floor, floor_size_m=size_m, floor_tint=paint)
 
 
 def _bare(rng: Rng, look: Look) -> Look:

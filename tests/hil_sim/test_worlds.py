@@ -114,6 +114,15 @@ def test_every_third_world_is_of_halls_large_high_and_bare():
     assert np.median(bare) > 0.5
 
 
+def test_most_halls_have_tape_on_their_floors():
+    taped = []
+    for seed in filter(is_hall, range(30)):
+        rooms = draw_layout(np.random.default_rng([seed, 7]), hall=True).rooms
+        world = generate(seed)
+        taped.append(len(np.unique(world.floor_surface[~world.blocked])) > len(rooms) + 2)
+    assert 5 <= sum(taped) < 10
+
+
 def test_seed_ranges_of_the_splits_do_not_meet():
     assert not set(TRAIN_SEEDS) & set(VALIDATION_SEEDS)
     assert not set(TEST_SEEDS) & (set(TRAIN_SEEDS) | set(VALIDATION_SEEDS))
