@@ -97,6 +97,11 @@ def _parser() -> argparse.ArgumentParser:
     shared.add_teaching(join)
     join.set_defaults(run=_join)
 
+    lint = commands.add_parser("lint", help="whether routes that pass the lint succeed more often")
+    shared.add_journeys(lint, length_m=10.0)
+    shared.add_teaching(lint)
+    lint.set_defaults(run=_lint, episodes=200)
+
     manifold = commands.add_parser("manifold", help="map the embeddings of many demonstrations")
     manifold.add_argument("--steps", type=int, default=100, help="length, 0.1 s each (%(default)s)")
     manifold.add_argument("--episodes", type=int, default=1000, help="how many (%(default)s)")
@@ -187,6 +192,14 @@ def _join(options: argparse.Namespace) -> None:
     result = join.measure(join.JoinConfig(shared.journeys(options), shared.teaching(options)))
     _write(options.json, result)
     _say(json.dumps({key: value for key, value in result.items() if key != "runs"}, indent=2))
+
+
+def _lint(options: argparse.Namespace) -> None:
+    from cbe_bench import lint
+
+    result = lint.measure(lint.LintConfig(shared.journeys(options), shared.teaching(options)))
+    _write(options.json, result)
+    _say(lint.table(result))
 
 
 def _compression(options: argparse.Namespace) -> None:

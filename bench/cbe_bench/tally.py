@@ -54,6 +54,22 @@ def paired_difference(only_a: int, only_b: int, pairs: int) -> tuple[float, floa
     return (only_b - only_a) / pairs, max(-1.0, middle - half), min(1.0, middle + half)
 
 
+def independent_difference(
+    successes_a: int, trials_a: int, successes_b: int, trials_b: int
+) -> tuple[float, float, float]:
+    """Success rate of a less that of b, other episodes, with its 95 % interval.
+
+    Newcombe (1998), from Wilson's intervals; (0, -1, 1) without trials of either.
+    """
+    if min(trials_a, trials_b) == 0:
+        return 0.0, -1.0, 1.0
+    a, b = successes_a / trials_a, successes_b / trials_b
+    low_a, high_a = wilson(successes_a, trials_a)
+    low_b, high_b = wilson(successes_b, trials_b)
+    low = a - b - math.hypot(a - low_a, high_b - b)
+    return a - b, low, a - b + math.hypot(high_a - a, b - low_b)
+
+
 def summary(records: Sequence[Record], config: Mapping[str, Any], model_id: str) -> dict[str, Any]:
     """What `--json` holds.
 

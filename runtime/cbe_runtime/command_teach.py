@@ -19,7 +19,7 @@ from cbe_runtime.drive import RecordedDrive
 from cbe_runtime.live import LiveDrive
 from cbe_runtime.networks import Networks
 from cbe_runtime.pathshape import PathShape
-from cbe_runtime.perturb import PERTURBATIONS, TURNS
+from cbe_runtime.perturb import PERTURBATIONS
 from cbe_runtime.progressbar import track
 from cbe_runtime.route import Precision
 from cbe_runtime.teach import Teacher
@@ -120,8 +120,7 @@ def _look_over(
 ) -> None:
     """Say how the route may be repeated; of a live drive, whose frames are gone, only a part."""
     frames = track(drive.frames(), "looking over", route.steps + 1) if drive else None
-    # Each costs as much as teaching did; turned views tell the most.
-    perturbations = PERTURBATIONS if options.lint else TURNS
+    perturbations = PERTURBATIONS if options.lint else {}  # each costs as much as teaching did
     verdict = forecast.judge(lint.look_over(networks, route, frames, perturbations))
     lines = verdict.lines() if options.lint else [verdict.summary()]
     sys.stdout.writelines(f"{line}\n" for line in lines)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cbe.errors import RouteError
-from cbe.geometry import wrap_angle
 from cbe_runtime.behavior import Behavior
 from cbe_runtime.follower import FollowerConfig
 from cbe_runtime.likeness import unlikeness
-from cbe_runtime.perturb import LEFT, PERTURBATIONS, RIGHT, TURN_PX, as_it_is
+from cbe_runtime.perturb import PERTURBATIONS, as_it_is
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -31,6 +29,8 @@ AROUND_STEPS = 10
 """Half a metre at full speed: a joint should look different from here."""
 SAME_FRAME = 0.1
 """Far above what rounding to 4 bits does to an attractor (0.016), far below another view's."""
+STILL_LEVELS = 4.0
+"""A pixel that varies by less, RMS in grey levels, shows no more of the place than its noise."""
 END_SHARE = 0.9  # from here on the waypoint may shrink to nothing
 
 
@@ -53,6 +53,18 @@ class Replay:
 
 
 @dataclass(frozen=True, slots=True)
+class Pictures:
+    """A segment's own frames, but for what the camera never covers.
+
+    `brightness` is their mean, 0 to 255; `still` the share of pixels that hardly vary while the
+    robot drives.
+    """
+
+    brightness: float
+    still: float
+
+
+@dataclass(frozen=True, slots=True)
 class Joint:
     """An attractor of a route, RMS differences as in `likeness.unlikeness`.
 
@@ -69,16 +81,12 @@ class Joint:
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A segment of a route; `replays` by perturbation, none where the drive is not known.
-
-    `correction` is the share of a turn that its waypoints make up for, 1 at best: what brings a
-    robot back that strays. None where turned views were not replayed.
-    """
+    """A segment of a route; without `replays` (by perturbation) where the drive is not known."""
 
     segment: int
     steps: int
     replays: Mapping[str, Replay] = field(default_factory=dict)
-    correction: float | None = None
+    pictures: Pictures | None = None
 
     @property
     def plain(self) -> Replay | None:
@@ -146,11 +154,15 @@ def _segment(
     shares = _steps(networks, views) / steps
     last = index + 1 == len(route.segments)
     replays = {name: _measure(each, shares, steps, last=last) for name, each in seen.items()}
-    correction = None
-    if {LEFT, RIGHT} <= seen.keys():
-        from_left_to_right_rad = 2.0 * math.atan(TURN_PX / networks.camera.fx)
-        correction = _turn(seen[LEFT], seen[RIGHT], shares) / from_left_to_right_rad
-    return Segment(index, steps, replays, correction)
+    return Segment(index, steps, replays, _pictures(views))
+
+
+def _pictures(views: Views) -> Pictures:
+    bright = np.stack(views).max(axis=-1)  # (T, 64, 64)
+    shown = bright[:, bright.any(axis=0)].astype(np.float32)  # (T, pixels)
+    if shown.size == 0:
+        return Pictures(0.0, 1.0)
+    return Pictures(float(shown.mean()), float((shown.std(axis=0) < STILL_LEVELS).mean()))
 
 
 def _cut(route: Route, frames: Iterable[NDArray[np.uint8]]) -> Iterator[Views]:
@@ -221,16 +233,6 @@ def _measure(
         waypoint_change_m=float(moves.mean()),
         on_route=float(np.mean([each.on_route for each in seen])),
     )
-
-
-def _turn(
-    left: Sequence[Prediction], right: Sequence[Prediction], shares: NDArray[np.float64]
-) -> float:
-    """Mean angle in rad from the waypoints of views turned left to those of views turned right."""
-    before_end = shares < END_SHARE  # near the end waypoints are too near to have a direction
-    left_m, right_m = (np.stack([each.waypoint_m for each in seen]) for seen in (left, right))
-    turned = np.arctan2(right_m[:, 1], right_m[:, 0]) - np.arctan2(left_m[:, 1], left_m[:, 0])
-    return float(wrap_angle(turned[before_end]).mean())
 
 
 def _done_at(

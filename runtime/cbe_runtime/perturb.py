@@ -62,10 +62,9 @@ def noisy(image: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
     return noised
 
 
-LEFT, RIGHT = "turned_left", "turned_right"
-TURNS: dict[str, Perturbation] = {LEFT: turned_left, RIGHT: turned_right}
 PERTURBATIONS: dict[str, Perturbation] = {
-    **TURNS,
+    "turned_left": turned_left,
+    "turned_right": turned_right,
     "brighter": brighter,
     "darker": darker,
     "blurred": blurred,

@@ -10,13 +10,14 @@ from cbe.images import compress
 from cbe.messages import CompressedImage
 from cbe_runtime import cli, forecast
 from cbe_runtime.forecast import Flag, judge
-from cbe_runtime.lint import AS_IT_IS, Findings, Joint, Replay, Segment, look_over
+from cbe_runtime.lint import AS_IT_IS, Findings, Joint, Pictures, Replay, Segment, look_over
 from cbe_runtime.mcapfile import Recorded, Recorder
 from cbe_runtime.networks import Networks
 from cbe_runtime.perturb import PERTURBATIONS
 from cbe_runtime.teach import Teacher
 
 SOUND = Replay(0.03, 1.0, 1.0, 1.0, 0.05, 0.98)
+LIT = Pictures(120.0, 0.1)
 
 
 def views(count, seed=0):
@@ -66,7 +67,6 @@ def test_figures_are_of_each_segment_and_joint(networks):
         assert segment.plain.done_at == pytest.approx(0.95)
         assert segment.plain.waypoint_ahead == 1.0
         assert segment.plain.waypoint_change_m == 0.0
-        assert segment.correction == 0.0  # the stub's waypoint is always straight ahead
 
 
 def test_frames_that_are_not_all_of_the_drive_are_refused(networks):
@@ -134,9 +134,9 @@ def test_without_frames_joints_and_lengths_are_still_judged(networks, route):
     assert verdict.findings.joints[0].nearest is not None
 
 
-def findings(*plain, change=0.4, nearest=0.45, perturbed=SOUND, correction=0.7):
+def findings(*plain, change=0.4, nearest=0.45, perturbed=SOUND, pictures=LIT):
     segments = tuple(
-        Segment(i, 60, {AS_IT_IS: each, "noisy": perturbed}, correction)
+        Segment(i, 60, {AS_IT_IS: each, "noisy": perturbed}, pictures)
         for i, each in enumerate(plain)
     )
     joints = tuple(Joint(i, change, nearest, 0) for i in range(len(plain) + 1))
@@ -162,7 +162,8 @@ def test_sound_route_passes_without_flags():
         findings(replace(SOUND, waypoint_change_m=0.3)),
         findings(replace(SOUND, on_route=0.2)),
         findings(SOUND, perturbed=replace(SOUND, progress_error=0.3)),
-        findings(SOUND, correction=0.3),
+        findings(SOUND, pictures=replace(LIT, brightness=20.0)),
+        findings(SOUND, pictures=replace(LIT, still=0.6)),
     ],
 )
 def test_every_fault_is_flagged_and_lowers_the_prediction(worse):
@@ -176,34 +177,19 @@ def test_weak_and_look_alike_joints_are_flagged():
     assert judge(findings(SOUND, nearest=0.2)).joint_flags == ((Flag.LOOK_ALIKE,),) * 2
 
 
-class Steered:
-    """Stands for networks whose waypoints point at the brightest column: they undo any turn."""
-
-    def __init__(self, networks):
-        self._networks = networks
-
-    def __getattr__(self, name):
-        return getattr(self._networks, name)
-
-    def encode(self, image, state):
-        features, embedding, state = self._networks.encode(image, state)
-        self._column = int(image.sum(axis=(0, 2)).argmax())
-        return features, embedding, state
-
-    def generate(self, **inputs):
-        prediction, state = self._networks.generate(**inputs)
-        bearing = np.arctan((self.camera.cx - 0.5 - self._column) / self.camera.fx)
-        waypoint_m = 0.5 * np.array([np.cos(bearing), np.sin(bearing)])
-        return replace(prediction, waypoint_m=waypoint_m), state
-
-
-def test_waypoint_that_stays_in_place_makes_up_for_a_turn(networks):
-    frames = views(41)
-    for frame in frames:
-        frame[:, 32] = 255
-    steered = Steered(networks)
-    found = look_over(steered, taught(steered, frames), frames)
-    assert found.segments[0].correction == pytest.approx(1.0, abs=0.05)
+def test_dark_and_covered_pictures_are_told(networks):
+    lit = views(41)
+    dark = [(frame / 12).astype(np.uint8) for frame in lit]
+    covered = [frame.copy() for frame in lit]
+    for frame in covered:
+        frame[:, :40] = 20
+    pictures = [
+        look_over(networks, taught(networks, frames), frames, {}).segments[0].pictures
+        for frames in (lit, dark, covered)
+    ]
+    assert pictures[0].brightness > 5.0 * pictures[1].brightness
+    assert pictures[0].still == 0.0
+    assert pictures[2].still == pytest.approx(40 / 64)
 
 
 def test_every_flag_is_explained():
