@@ -102,6 +102,16 @@ def _parser() -> argparse.ArgumentParser:
     shared.add_teaching(lint)
     lint.set_defaults(run=_lint, episodes=200)
 
+    long = commands.add_parser("long", help="file, load time, memory and tick of very long routes")
+    long.add_argument(
+        "--length-m", type=shared.numbers, default=[1000.0, 10000.0], metavar="M,M,...",
+        help="beside 20 m (1000,10000)",
+    )  # fmt: skip
+    shared.add_precision(long)
+    long.add_argument("--model", type=Path, metavar="DIR", help="folder of ONNX files")
+    shared.add_output(long)
+    long.set_defaults(run=_long)
+
     manifold = commands.add_parser("manifold", help="map the embeddings of many demonstrations")
     manifold.add_argument("--steps", type=int, default=100, help="length, 0.1 s each (%(default)s)")
     manifold.add_argument("--episodes", type=int, default=1000, help="how many (%(default)s)")
@@ -200,6 +210,16 @@ def _lint(options: argparse.Namespace) -> None:
     result = lint.measure(lint.LintConfig(shared.journeys(options), shared.teaching(options)))
     _write(options.json, result)
     _say(lint.table(result))
+
+
+def _long(options: argparse.Namespace) -> None:
+    from cbe_bench import long
+    from cbe_bench.route import precision_of
+
+    precision, model = precision_of(options.precision), shared.model(options)
+    result = long.measure(options.length_m, model, precision, _note)
+    _write(options.json, result)
+    _say(long.table(result))
 
 
 def _compression(options: argparse.Namespace) -> None:

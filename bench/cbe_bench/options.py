@@ -160,6 +160,14 @@ def integers(text: str) -> list[int]:
     return [int(part) for part in text.split(",")]
 
 
+def numbers(text: str) -> list[float]:
+    """Numbers above 0 between commas."""
+    values = [float(part) for part in text.split(",")]
+    if not all(0.0 < value < math.inf for value in values):
+        raise argparse.ArgumentTypeError(f"numbers above 0 are needed; found {text!r}")
+    return values
+
+
 def precisions(text: str) -> list[AttractorPrecision]:
     """Precisions between commas."""
     return [AttractorPrecision(part) for part in text.split(",")]
