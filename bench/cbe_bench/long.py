@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from cbe.camera import MODEL_CAMERA
 from cbe.robot import STEP_S, Robot
+from cbe_bench.demo_processes import rss_mib
 from cbe_runtime import routefile
 from cbe_runtime.follower import Follower
 from cbe_runtime.networks import Networks
@@ -29,7 +30,6 @@ Views = Sequence[NDArray[np.uint8]]
 SHORT_M = 20.0
 FILMED_STEPS = 400
 ROUNDS, LOADS, TICKS = 3, 5, 400
-MIB = 2**20
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,10 +115,10 @@ def _teach(
     """Stream a drive of that length into a route file."""
     steps = round(length_m / (STEP_S * Robot().max_speed_mps))
     teacher = Teacher(networks, MODEL_CAMERA, total_steps=steps, precision=precision)
-    before_mib = _rss_mib()
+    before_mib = rss_mib(os.getpid())
     for view in _driven(views, steps + 1):
         teacher.feed(view)
-    grown_mib = _rss_mib() - before_mib
+    grown_mib = rss_mib(os.getpid()) - before_mib
     route = teacher.finish()
     size = routefile.save(route, _path(folder, length_m))
     return {
@@ -137,7 +137,7 @@ def _carry(path: Path, model: Path, views: Views) -> Carried:
     """Load and begin a route, in a process that has nothing else in it."""
     networks, robot = Networks.load(model), Robot()
     scan_m = np.full(robot.scan_rays, 3.0)
-    before_mib = _rss_mib()
+    before_mib = rss_mib(os.getpid())
     loads_s = []
     for _ in range(LOADS):
         began_s = time.perf_counter()
@@ -153,11 +153,5 @@ def _carry(path: Path, model: Path, views: Views) -> Carried:
         ticked = follower.step(seen, now_s).ticked
         if ticked:
             ticks_s.append(time.perf_counter() - began_s)
-    return Carried(
-        statistics.median(loads_s), _rss_mib() - before_mib, 1e3 * statistics.median(ticks_s)
-    )
-
-
-def _rss_mib() -> float:
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / MIB
+    grown_mib = rss_mib(os.getpid()) - before_mib
+    return Carried(statistics.median(loads_s), grown_mib, 1e3 * statistics.median(ticks_s))

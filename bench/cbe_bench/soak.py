@@ -15,7 +15,7 @@ from cbe.errors import CbeError, LinkError
 from cbe.link import Link
 from cbe.linkconfig import LinkConfig
 from cbe_bench.demo_course import choose
-from cbe_bench.demo_processes import Child, Crew, ProcessError, free_port
+from cbe_bench.demo_processes import Child, Crew, ProcessError, free_port, rss_mib
 from cbe_bench.demo_stage import DemoConfig, Stage
 from cbe_bench.demo_witness import Witness
 from cbe_hil_sim.generate import TEST_HOUSES, generate
@@ -34,7 +34,6 @@ LAP_S = 120.0
 WARM_SHARE = 0.2
 """Of the time, until memory is compared: by then every buffer has its size."""
 GROWTH_MIB, MISSED_SHARE, P99_MS, WORST_MS = 2.0, 0.001, 5.0, 50.0
-MIB = 2**20
 
 
 class BarError(CbeError):
@@ -138,7 +137,7 @@ def _soak(link: Link, runtime: Child, course: Course, duration_s: float) -> Soak
             link.call("start")
             lap_s = now_s
         time.sleep(5.0 * POLL_S if now_s == lap_s else POLL_S)
-        rss.append(_rss_mib(runtime.pid))
+        rss.append(rss_mib(runtime.pid))
         newest = statuses.get()
         if newest is not None and newest.message is not None:
             status = newest.message
@@ -183,11 +182,6 @@ def _connected(endpoint: str, sim: Child) -> Link:
         except LinkError:
             if time.monotonic() - began_s > SIM_START_S:
                 raise
-
-
-def _rss_mib(pid: int) -> float:
-    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / MIB
 
 
 def _cpu_s(pid: int) -> float:
