@@ -13,15 +13,13 @@ from cbe.robot import STEP_S, Robot
 from cbe_bench.rooms import rooms
 from cbe_hil_sim.astar import SPACING_M, GoalField
 from cbe_hil_sim.demonstrator import ENDPOINT_CLEARANCE_M, PATH_CLEARANCE_M, sample_routes
+from cbe_hil_sim.tours import middles, roomy, tour
 from cbe_hil_sim.world import World
 
 LENGTH_SPREAD = 0.15  # a journey's length is drawn from so much below and above that asked for,
 END_SPREAD = 0.05  # and met so well
 _LEAD_M, _TAIL_M = 1.5, 6.0  # a path is longer than the piece by something between
 _STARTS, _ENDS, _TOURS = 6, 3, 6
-_TRIES = 100
-_LEG_POINTS, _LEG_SHARE, _LEG_TRIES = 20, 0.7, 8
-_SHARPEST_RAD = math.radians(150.0)  # turn from leg to leg; what the car cannot drive, fails
 
 
 class Drives(Protocol):
@@ -61,7 +59,7 @@ class Pieces:
         try:
             return sample_routes(world, 1, rng, shortest, longest)[0]
         except WorldError:
-            return _tour(world, rng, shortest, _roomy(world))
+            return tour(world, rng, shortest, roomy(world))
 
     def part(
         self, poses: NDArray[np.float64], rng: np.random.Generator
@@ -102,7 +100,7 @@ class Journeys:
         """See `Drives`."""
         room = rooms(world)
         within = (world.clearance_m >= ENDPOINT_CLEARANCE_M) & (room > 0)
-        places = _points(world, within) if within.any() else _roomy(world)
+        places = middles(world, within) if within.any() else roomy(world)
         if len(places) == 0:
             return None
         length_m = self.length_m * (1.0 + rng.uniform(-LENGTH_SPREAD, LENGTH_SPREAD))
@@ -143,52 +141,6 @@ def _ways(
         for end in rng.choice(far, _ENDS) if len(far) else far:
             yield field.path(end)[::-1]
     for _ in range(_TOURS):
-        tour = _tour(world, rng, high_m, places)
-        if tour is not None:
-            yield tour
-
-
-def _points(world: World, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Middles (K, 2) of the chosen cells (rows, columns)."""
-    cells = np.argwhere(chosen)[:, ::-1]
-    points: NDArray[np.float64] = (cells + 0.5) * world.resolution_m + np.array(world.origin_m)
-    return points
-
-
-def _roomy(world: World) -> NDArray[np.float64]:
-    """Places (K, 2) in the middle of rooms: a way that is cut short there goes on ahead."""
-    roomy = world.clearance_m[world.clearance_m >= ENDPOINT_CLEARANCE_M]
-    if len(roomy) == 0:
-        return np.empty((0, 2))
-    return _points(world, world.clearance_m >= np.quantile(roomy, 0.6))
-
-
-def _tour(
-    world: World, rng: np.random.Generator, length_m: float, places: NDArray[np.float64]
-) -> NDArray[np.float64] | None:
-    """A path (N, 2) towards one of the `places` (K, 2) after another, or None."""
-    if len(places) == 0:
-        return None
-    start, legs, refused = rng.choice(places), list[NDArray[np.float64]](), 0
-    for _ in range(_TRIES):
-        here = legs[-1][-1] if legs else start
-        field = GoalField(world, rng.choice(places))
-        reachable = np.isfinite(field.cost_at(here[None])[0])
-        leg = field.path(here) if reachable else here[None]
-        if len(leg) >= _LEG_POINTS and (not legs or _turn(legs[-1], leg) <= _SHARPEST_RAD):
-            legs.append(leg[: max(_LEG_POINTS, round(_LEG_SHARE * len(leg)))])
-            refused = 0
-            if sum(map(len, legs)) * SPACING_M >= length_m:
-                return np.concatenate(legs)
-            continue
-        refused += 1
-        if refused >= _LEG_TRIES:  # a dead end: the last leg leads into a corner
-            start, refused = rng.choice(places) if not legs else start, 0
-            del legs[-1:]
-    return None
-
-
-def _turn(before: NDArray[np.float64], after: NDArray[np.float64]) -> float:
-    """Angle between the end of one path and the beginning of the next."""
-    a, b = before[-1] - before[-7], after[6] - after[0]
-    return abs(math.atan2(float(a[0] * b[1] - a[1] * b[0]), float(a @ b)))
+        way = tour(world, rng, high_m, places)
+        if way is not None:
+            yield way

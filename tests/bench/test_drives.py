@@ -5,7 +5,6 @@ import pytest
 
 from cbe.errors import ConfigError
 from cbe.robot import Robot
-from cbe_bench import drives
 from cbe_bench.drives import Journeys
 from cbe_bench.rooms import rooms
 from cbe_hil_sim.floorplan import FloorPlan, from_floorplan
@@ -100,11 +99,3 @@ def test_drive_in_circles_is_not_taken() -> None:
 def test_length_that_is_none_is_refused(length) -> None:
     with pytest.raises(ConfigError, match="at least 1 m long"):
         Journeys(length)
-
-
-def test_small_world_is_toured_until_the_length_is_reached(two_rooms) -> None:
-    world = two_rooms  # in which no straight way is 10 m long
-    path = drives._tour(world, np.random.default_rng(0), 10.0, drives._roomy(world))
-    assert path is not None
-    assert np.hypot(*np.diff(path, axis=0).T).sum() >= 9.5
-    assert world.clearance_at(path).min() > Robot().body_radius_m

@@ -14,10 +14,12 @@ from cbe_hil_sim.clearance import Clearance
 from cbe_hil_sim.demonstrator import demonstrate, sample_routes
 from cbe_hil_sim.floorplan import from_floorplan
 from cbe_hil_sim.generate import VALIDATION_SEEDS, generate
+from cbe_hil_sim.tours import roomy, tour
 from cbe_hil_sim.world import BIN_SIZE_M, World
 from cbe_hil_sim.worldbatch import WorldBatch
 
 SHORTEST_M, LONGEST_M = 8.0, 25.0
+TOURED = 0.4  # share of the drives that go on and on, with turns as tight as the car's
 BINS = 8  # at most, in a world's twin
 BIN_RADIUS_M, BIN_HEIGHT_M = 0.5 * BIN_SIZE_M[0], BIN_SIZE_M[2]
 BIN_ASIDE_M = 0.3  # of a drive, at most
@@ -90,7 +92,7 @@ def unseen(worlds: int, per_world: int, cache: Path) -> Drives:
 
 def cache_name(worlds: list[World], per_world: int) -> str:
     """File name of cached drives: it changes with whatever the robot could run into."""
-    digest = hashlib.sha256(str(per_world).encode())
+    digest = hashlib.sha256(f"{per_world} {TOURED}".encode())
     for world in worlds:
         digest.update(world.blocked.tobytes())
     return f"drives-{digest.hexdigest()[:12]}.npz"
@@ -127,7 +129,13 @@ def _drive(
         paths, where = [], []
         for index, world in enumerate(some):
             rng = np.random.default_rng([seeds[first + index], 1])
-            routes = sample_routes(world, per_world, rng, SHORTEST_M, LONGEST_M)
+            toured = round(TOURED * per_world)
+            routes = sample_routes(world, per_world - toured, rng, SHORTEST_M, LONGEST_M)
+            places = roomy(world)
+            ways = [
+                tour(world, rng, rng.uniform(SHORTEST_M, LONGEST_M), places) for _ in range(toured)
+            ]
+            routes += [way for way in ways if way is not None]
             paths += routes
             where += [index] * len(routes)
         done = demonstrate(WorldBatch.pack(some), some, np.array(where), paths, robot)
