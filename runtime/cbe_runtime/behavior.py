@@ -41,6 +41,15 @@ class Behavior:
             return 0.0
         return float(unlikeness(self.sight.attractor, self._goal))
 
+    def unlike_goal_in(self, image: NDArray[np.uint8]) -> float:
+        """How unlike its end this one frame (64, 64, 3) is; no state is touched.
+
+        Raises:
+            ModelError: an output is not finite.
+        """
+        seen = Sight.of(self._networks, image, None)
+        return float(unlikeness(seen.attractor, self._goal))
+
     @property
     def fresh(self) -> bool:
         """Whether it has seen no frame yet."""

@@ -11,11 +11,12 @@ import numpy as np
 
 from cbe.controller import Motion, RmpController, twist
 from cbe.errors import ModelError
-from cbe.parking import REACH_M, Parking
+from cbe.parking import REACH_M
 from cbe.robot import STEP_S, Robot
 from cbe.signature import OVERRUN_M
 from cbe.stop_zone import limit
 from cbe_runtime.behavior import Behavior
+from cbe_runtime.berth import Berth, BerthConfig
 from cbe_runtime.caution import slowed
 from cbe_runtime.joining import JoinConfig, Search, Whereabouts, advice
 from cbe_runtime.lost import LostBelief, LostConfig
@@ -47,6 +48,7 @@ class FollowerConfig:
     timeout_steps: int = 100  # ... and this many more
     lost: LostConfig = field(default_factory=LostConfig)
     join: JoinConfig = field(default_factory=JoinConfig)
+    berth: BerthConfig = field(default_factory=BerthConfig)
 
     def ends(self, prediction: Prediction, steps: int, *, last: bool) -> bool:
         """Whether a tick says that a behavior of so many steps, a route's last or not, is done."""
@@ -124,7 +126,7 @@ class Follower:
         self._robot = robot or Robot()
         self._config = config or FollowerConfig()
         self._controller = RmpController(self._robot)
-        self._parking = Parking(self._robot)
+        self._berth = Berth(self._robot, self._config.berth)
         self._camera_watch = StampWatch(
             self._config.fresh_s, Reason.STALE_CAMERA, Reason.FROZEN_CAMERA
         )
@@ -147,7 +149,6 @@ class Follower:
         self._seen_stamp_ns: int | None = None
         self._prediction: Prediction | None = None
         self._waypoint_m: tuple[float, float] | None = None  # at the present pose
-        self._rest = np.zeros(3)  # where ARRIVED comes to stand, likewise
 
     @property
     def model_id(self) -> str:
@@ -213,6 +214,8 @@ class Follower:
             assert observation.frame is not None
             tick = self._follow if state is State.FOLLOWING else self._look_for_place
             ticked = tick(image, observation.frame)
+        elif state is State.ARRIVED and image is not None and observation.frame is not None:
+            ticked = self._look_at_end(image, observation.frame)
         self._move(ranges_m, now_s)
         return self._decision(observation, now_s, ticked)
 
@@ -274,12 +277,16 @@ class Follower:
 
     def _ticked(self, frame: Frame, prediction: Prediction | None) -> None:
         """Keep what a tick on the frame said, if anything."""
-        self._gap_steps, self._since_tick_steps = self._since_tick_steps, 0
-        self._seen_stamp_ns = frame.stamp_ns
+        self._saw(frame)
         self._prediction = prediction
         self._waypoint_m = None
         if prediction is not None:
             self._waypoint_m = (float(prediction.waypoint_m[0]), float(prediction.waypoint_m[1]))
+
+    def _saw(self, frame: Frame) -> None:
+        """Note that a network ran on the frame."""
+        self._gap_steps, self._since_tick_steps = self._since_tick_steps, 0
+        self._seen_stamp_ns = frame.stamp_ns
 
     def _judge_progress(self, prediction: Prediction) -> None:
         """Start the next behavior, or arrive, once enough ticks in a row say so."""
@@ -297,7 +304,8 @@ class Follower:
             self._begin(self._behavior.segment + 1)
         elif as_remembered:
             self._machine.update(Events(arrived=True))
-            self._rest, self._waypoint_m = rest, (float(rest[0]), float(rest[1]))
+            self._berth.choose(rest, self._behavior.unlike_goal)
+            self._waypoint_m = self._berth.place_m
 
     def _end(self, prediction: Prediction) -> NDArray[np.float64]:
         """The behavior's last pose (3,) in base_link, as the view shows it."""
@@ -306,6 +314,19 @@ class Follower:
             return np.array([x, y, math.atan2(sin, cos)])
         x, y = prediction.waypoint_m  # nothing else tells
         return np.array([x - OVERRUN_M, y, 0.0])
+
+    def _look_at_end(self, image: NDArray[np.uint8], frame: Frame) -> bool:
+        """Compare the view with the end's if that is due; tells whether a network ran."""
+        moving = float(self._motion.speed_mps[0]) > 0.0
+        if not (moving and self._behavior.pinned and self._due(frame)):
+            return False
+        try:
+            self._berth.look(self._behavior.unlike_goal_in(image))
+        except ModelError:
+            return False  # where it was to stand still holds
+        self._saw(frame)
+        self._waypoint_m = self._berth.place_m
+        return True
 
     def _lose(self) -> None:
         """Stand, and look for the place."""
@@ -383,7 +404,7 @@ class Follower:
         else:
             scan_m = ranges_m[None]  # (1, rays)
             if state is State.ARRIVED:
-                motion = self._parking.step(self._motion, self._rest)
+                motion = self._berth.step(self._motion)
             else:
                 goal_m = np.array([self._waypoint_m])  # (1, 2)
                 motion = self._controller.step(self._motion, goal_m, scan_m)
@@ -398,7 +419,7 @@ class Follower:
             self._command = (float(speed[0]), float(yaw_rate[0]))
 
     def _carry_waypoint(self) -> None:
-        """Express waypoint and rest at the present pose, dead-reckoned over the step gone by."""
+        """Express the waypoint at the present pose, dead-reckoned over the step gone by."""
         if self._waypoint_m is None:
             return
         speed, yaw_rate = twist(self._motion, self._robot)
@@ -409,7 +430,7 @@ class Follower:
         cos, sin = math.cos(turn_rad), math.sin(turn_rad)
         self._waypoint_m = (cos * x + sin * y, cos * y - sin * x)
         if self._machine.state is State.ARRIVED:
-            self._rest = np.array([*self._waypoint_m, self._rest[2] - turn_rad])
+            self._berth.carry(self._waypoint_m, travel_m, turn_rad)
 
     def _decision(self, observation: Observation, now_s: float, ticked: bool) -> Decision:
         frame, scan = observation.frame, observation.scan

@@ -1,0 +1,80 @@
+"""Where an arrived robot comes to stand, and how far it still drives to get there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cbe.parking import REACH_M, Parking
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from cbe.controller import Motion
+    from cbe.robot import Robot
+
+
+@dataclass(frozen=True, slots=True)
+class BerthConfig:
+    """When the end is held to be still ahead, whatever was read on arrival."""
+
+    nearing: float = 0.004  # unlikeness that a view must be below all before to be nearer
+    past: float = 0.012  # above the lowest: the end lies behind
+    looks: int = 2  # in a row that are not nearer, likewise
+    ahead_m: float = 0.05  # the end is held to be so far ahead: it creeps on
+
+
+class Berth:
+    """The pose of a route's end, as seen on arrival and then carried along by dead reckoning.
+
+    In wide bare halls the end is read as nearer than it is, by up to 0.5 m. The view tells: it
+    gets ever more like the end's up to there and less so beyond (in validation worlds the most
+    alike of views 0.1 m apart was within 0.1 m of the end for 114 of 120), so the robot does not
+    stop while it does.
+    """
+
+    def __init__(self, robot: Robot, config: BerthConfig) -> None:
+        self._parking = Parking(robot)
+        self._config = config
+        self._lowest = 1.0  # unlikeness of the end's, of all views since arrival
+        self._vain = 0  # looks in a row that were not nearer
+        self._driven_m = 0.0  # since arrival
+        self._beyond = False  # where the end was read
+        self.pose = np.zeros(3)
+        """In base_link: x, y in m, yaw in rad."""
+
+    @property
+    def place_m(self) -> tuple[float, float]:
+        """x, y of `pose`."""
+        return float(self.pose[0]), float(self.pose[1])
+
+    def choose(self, pose: NDArray[np.float64], unlike: float) -> None:
+        """Arrive: come to stand in `pose` (3,); the view is so unlike the end's."""
+        self.pose, self._lowest, self._vain = pose, unlike, 0
+        self._driven_m, self._beyond = 0.0, False
+
+    def look(self, unlike: float) -> None:
+        """Take how unlike the end's the next view is."""
+        nearer = unlike < self._lowest - self._config.nearing
+        past = unlike > self._lowest + self._config.past
+        self._vain = 0 if nearer else self._vain + (self._config.looks if past else 1)
+        self._lowest = min(self._lowest, unlike)
+        if self._beyond and not self._ahead:
+            self.pose[0] = min(self.pose[0], 0.0)
+
+    @property
+    def _ahead(self) -> bool:
+        return self._vain < self._config.looks and self._driven_m < REACH_M
+
+    def carry(self, place_m: tuple[float, float], travel_m: float, turn_rad: float) -> None:
+        """Take a step of the robot, after which the pose's place is `place_m` (x, y)."""
+        self.pose = np.array([*place_m, self.pose[2] - turn_rad])
+        self._driven_m += travel_m
+        if self._ahead and self.pose[0] < self._config.ahead_m:
+            self.pose[0], self._beyond = self._config.ahead_m, True
+
+    def step(self, motion: Motion) -> Motion:
+        """Next commanded motion (1,), from the present one."""
+        return self._parking.step(motion, self.pose)

@@ -1,0 +1,54 @@
+"""An arrived robot stands where it saw the end, or farther on while its view gets more alike."""
+
+import numpy as np
+import pytest
+
+from cbe.controller import Motion
+from cbe.parking import REACH_M
+from cbe.robot import STEP_S, Robot
+from cbe_runtime.berth import Berth, BerthConfig
+
+
+def driven_m(read_m, unlike):
+    """How far it drives from where the end was read `read_m` ahead; `unlike` is of the distance."""
+    berth = Berth(Robot(), BerthConfig())
+    berth.choose(np.array([read_m, 0.0, 0.0]), unlike(0.0))
+    motion, x_m = Motion(np.array([0.5]), np.zeros(1)), 0.0
+    for step in range(100):
+        motion = berth.step(motion)
+        travel_m = float(motion.speed_mps[0]) * STEP_S
+        if travel_m == 0.0:
+            return x_m
+        x_m += travel_m
+        berth.carry((berth.pose[0] - travel_m, 0.0), travel_m, 0.0)
+        if step % 2 == 1:
+            berth.look(unlike(x_m))
+    pytest.fail("never stood")
+
+
+def test_stands_where_the_end_was_read_if_the_view_agrees():
+    assert driven_m(0.4, lambda x_m: 0.1 + 0.2 * abs(x_m - 0.4)) == pytest.approx(0.4, abs=0.12)
+
+
+@pytest.mark.parametrize("end_m", [0.4, 0.6])
+def test_drives_on_to_an_end_that_was_read_too_near(end_m):
+    stood_m = driven_m(0.15, lambda x_m: 0.1 + 0.2 * abs(x_m - end_m))
+    assert stood_m == pytest.approx(end_m, abs=0.15)
+
+
+def test_view_that_does_not_change_says_nothing():
+    assert driven_m(0.2, lambda x_m: 0.2) == pytest.approx(0.2, abs=0.05)
+
+
+def test_view_that_gets_more_alike_for_ever_does_not_lead_astray():
+    assert driven_m(0.2, lambda x_m: 1.0 - 0.3 * x_m) < REACH_M + 0.2
+
+
+def test_arriving_again_begins_anew():
+    berth = Berth(Robot(), BerthConfig())
+    for _ in range(2):
+        berth.choose(np.array([0.02, 0.0, 0.0]), 0.3)
+        berth.carry((-0.03, 0.0), 0.05, 0.0)
+        berth.look(0.2)
+        assert berth.place_m == (BerthConfig().ahead_m, 0.0)
+        berth.carry((0.0, 0.0), REACH_M, 0.0)
