@@ -131,6 +131,20 @@ def _parser() -> argparse.ArgumentParser:
     shared.add_behaviors(faults)
     faults.set_defaults(run=_faults, episodes=40)
 
+    card = commands.add_parser("card", help="all figures of the model card, going on where it was")
+    card.add_argument(
+        "--folder", type=Path, default=Path("runs/card"), help="of the results (%(default)s)"
+    )
+    card.add_argument(
+        "--only", metavar="TEXT", default="", help="runs whose names contain this, as route or bin"
+    )
+    card.add_argument(
+        "--share", type=float, default=1.0, metavar="S", help="of the episodes (%(default)s)"
+    )
+    card.add_argument("--scenes", type=Path, metavar="DIR", help="folder of the mesh scenes")
+    card.add_argument("--model", type=Path, metavar="DIR", help="folder of ONNX files")
+    card.set_defaults(run=_card)
+
     compare = commands.add_parser("compare", help="compare two results episode by episode")
     for name in ("a", "b"):
         compare.add_argument(name, type=Path, help="JSON of cbe-bench single or route")
@@ -283,6 +297,22 @@ def _faults(options: argparse.Namespace) -> None:
     result = faults.measure(faults.FaultsConfig(run, chosen(options.faults)))
     _write(options.json, result)
     _say(faults.table(result))
+
+
+def _card(options: argparse.Namespace) -> None:
+    from cbe_bench import card
+
+    def call(arguments: list[str]) -> None:
+        asked = _parser().parse_args(arguments)
+        asked.run(asked)
+
+    every = [line.of(options.share) for line in card.lines(options.scenes)]
+    chosen = [line for line in every if options.only in line.name]
+    if not chosen:
+        names = ", ".join(line.name for line in every)
+        raise ConfigError(f"no run's name contains {options.only!r}; there are {names}")
+    done = card.run(chosen, options.folder, shared.model(options), call, _note)
+    _say(card.table(done))
 
 
 def _compare(options: argparse.Namespace) -> None:
