@@ -188,10 +188,18 @@ def observe(backend: Backend, see: See, step: int) -> Observation:
     )
 
 
-def film(backend: Backend, see: See, poses: NDArray[np.float64]) -> list[NDArray[np.uint8]]:
-    """The networks' views from poses (T, 3), as a camera driven along them sees them."""
-    views = []
-    for pose in poses:
-        backend.reset(pose[None])
-        views.append(see(backend.observe().images[0]))
+def film(
+    backend: Backend, see: See, poses: NDArray[np.float64], every: int = 1
+) -> list[NDArray[np.uint8]]:
+    """The networks' views from poses (T, 3), as a camera driven along them sees them.
+
+    Only `every` so manyeth is looked from, and the last; between them a view stays as it was.
+    """
+    views: list[NDArray[np.uint8]] = []
+    for step, pose in enumerate(poses):
+        if step % every == 0 or step == len(poses) - 1:
+            backend.reset(pose[None])
+            views.append(see(backend.observe().images[0]))
+        else:
+            views.append(views[-1])
     return views

@@ -201,7 +201,8 @@ def _drive_group(
 def stored_route(stage: Stage, teach: Teach) -> tuple[Route, int]:
     """The route of the stage's drive as its file holds it, and that file's bytes."""
     with stage.place.backend() as (backend, see):
-        views = film(backend, see, stage.scenario.demonstration)
+        # Rendering meshes takes most of the time, and the teacher looks at these views alone.
+        views = film(backend, see, stage.scenario.demonstration, stage.networks.network_period)
     data = routefile.dump(teach(stage.networks, views))
     return routefile.parse(data), len(data)
 

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from cbe.errors import CbeError
-from cbe_bench.episode import Outcome, ride
+from cbe_bench.episode import Outcome, film, ride
 from cbe_hil_sim.backend import Observation as Seen
 from cbe_hil_sim.vehicle import Vehicle
 from cbe_runtime.follower import Decision
@@ -199,3 +199,17 @@ def test_stamps_advance_by_a_step() -> None:
     run(script)
     stamps = [seen.frame.stamp_ns for seen in script.seen[:3]]
     assert stamps == [0, 100_000_000, 200_000_000]
+
+
+class Milestones(OpenSpace):
+    """Shows how far along x it is."""
+
+    def observe(self) -> Seen:
+        level = round(float(self.poses[0, 0]) / 0.05)
+        return Seen(np.full((1, 64, 64, 3), level, np.uint8), np.full((1, 240), np.inf, np.float32))
+
+
+@pytest.mark.parametrize(("steps", "seen"), [(4, [0, 0, 2, 2, 4]), (5, [0, 0, 2, 2, 4, 5])])
+def test_film_of_every_second_step_looks_from_those_and_the_last(steps, seen) -> None:
+    views = film(Milestones(), lambda image: image, straight(steps), every=2)
+    assert [int(view[0, 0, 0]) for view in views] == seen
