@@ -24,7 +24,7 @@ def main() -> int:
         "--network-period", type=int, choices=(1, 2), default=2, help="steps between network ticks"
     )
     parser.add_argument(
-        "--segment-steps", type=int, default=100, help="K: longest behavior in steps"
+        "--segment-steps", type=int, default=72, help="K: longest behavior in steps (%(default)s)"
     )
     parser.add_argument(
         "--cache", type=Path, default=Path("runs/drives"), help="folder of cached drives"

@@ -42,11 +42,13 @@ class Behavior:
         return float(unlikeness(self.sight.attractor, self._goal))
 
     def unlike_goal_in(self, image: NDArray[np.uint8]) -> float:
-        """How unlike its end this one frame (64, 64, 3) is; no state is touched.
+        """`unlike_goal` of this one frame (64, 64, 3); no state is touched.
 
         Raises:
             ModelError: an output is not finite.
         """
+        if not self.pinned:
+            return 0.0
         seen = Sight.of(self._networks, image, None)
         return float(unlikeness(seen.attractor, self._goal))
 

@@ -1,4 +1,4 @@
-"""Where an arrived robot comes to stand, and how far it still drives to get there."""
+"""Where an arriving robot comes to stand, and how far it still drives to get there."""
 
 from __future__ import annotations
 
@@ -18,16 +18,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class BerthConfig:
-    """When the end is held to be still ahead, whatever was read on arrival."""
+    """When the end is held to be still ahead, wherever it was read."""
 
     nearing: float = 0.004  # unlikeness that a view must be below all before to be nearer
     past: float = 0.012  # above the lowest: the end lies behind
     looks: int = 2  # in a row that are not nearer, likewise
     ahead_m: float = 0.05  # the end is held to be so far ahead: it creeps on
+    held_up_m: float = 0.1
 
 
 class Berth:
-    """The pose of a route's end, as seen on arrival and then carried along by dead reckoning.
+    """The pose of a route's end, read off a view and then carried along by dead reckoning.
 
     In wide bare halls the end is read as nearer than it is, by up to 0.5 m. The view tells: it
     gets ever more like the end's up to there and less so beyond (in validation worlds the most
@@ -38,10 +39,13 @@ class Berth:
     def __init__(self, robot: Robot, config: BerthConfig) -> None:
         self._parking = Parking(robot)
         self._config = config
-        self._lowest = 1.0  # unlikeness of the end's, of all views since arrival
         self._vain = 0  # looks in a row that were not nearer
-        self._driven_m = 0.0  # since arrival
+        self._driven_m = 0.0  # since it was taken
         self._beyond = False  # where the end was read
+        self.taken = False
+        """Whether the robot is on its way there."""
+        self.lowest = 1.0
+        """Unlikeness of the end's, of all views since it was taken."""
         self.pose = np.zeros(3)
         """In base_link: x, y in m, yaw in rad."""
 
@@ -50,17 +54,22 @@ class Berth:
         """x, y of `pose`."""
         return float(self.pose[0]), float(self.pose[1])
 
-    def choose(self, pose: NDArray[np.float64], unlike: float) -> None:
-        """Arrive: come to stand in `pose` (3,); the view is so unlike the end's."""
-        self.pose, self._lowest, self._vain = pose, unlike, 0
-        self._driven_m, self._beyond = 0.0, False
+    @property
+    def held_up(self) -> bool:
+        """Whether there is more to drive than a robot leaves when it comes to stand."""
+        return float(self.pose[0]) > self._config.held_up_m
+
+    def take(self, pose: NDArray[np.float64], unlike: float) -> None:
+        """Begin to park in `pose` (3,); the view is so unlike the end's."""
+        self.taken, self.pose, self.lowest = True, pose, unlike
+        self._vain, self._driven_m, self._beyond = 0, 0.0, False
 
     def look(self, unlike: float) -> None:
         """Take how unlike the end's the next view is."""
-        nearer = unlike < self._lowest - self._config.nearing
-        past = unlike > self._lowest + self._config.past
+        nearer = unlike < self.lowest - self._config.nearing
+        past = unlike > self.lowest + self._config.past
         self._vain = 0 if nearer else self._vain + (self._config.looks if past else 1)
-        self._lowest = min(self._lowest, unlike)
+        self.lowest = min(self.lowest, unlike)
         if self._beyond and not self._ahead:
             self.pose[0] = min(self.pose[0], 0.0)
 

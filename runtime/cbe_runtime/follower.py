@@ -214,8 +214,6 @@ class Follower:
             assert observation.frame is not None
             tick = self._follow if state is State.FOLLOWING else self._look_for_place
             ticked = tick(image, observation.frame)
-        elif state is State.ARRIVED and image is not None and observation.frame is not None:
-            ticked = self._look_at_end(image, observation.frame)
         self._move(ranges_m, now_s)
         return self._decision(observation, now_s, ticked)
 
@@ -253,6 +251,8 @@ class Follower:
         if self._age_steps > config.timeout_factor * self._behavior.steps + config.timeout_steps:
             self._machine.update(Events(fault=Reason.TIMEOUT))
             return False
+        if self._berth.taken:
+            return self._park(image, frame)
         if not self._due(frame):
             return False
         try:
@@ -303,8 +303,7 @@ class Follower:
         if not last:
             self._begin(self._behavior.segment + 1)
         elif as_remembered:
-            self._machine.update(Events(arrived=True))
-            self._berth.choose(rest, self._behavior.unlike_goal)
+            self._berth.take(rest, self._behavior.unlike_goal)
             self._waypoint_m = self._berth.place_m
 
     def _end(self, prediction: Prediction) -> NDArray[np.float64]:
@@ -315,18 +314,32 @@ class Follower:
         x, y = prediction.waypoint_m  # nothing else tells
         return np.array([x - OVERRUN_M, y, 0.0])
 
-    def _look_at_end(self, image: NDArray[np.uint8], frame: Frame) -> bool:
-        """Compare the view with the end's if that is due; tells whether a network ran."""
-        moving = float(self._motion.speed_mps[0]) > 0.0
-        if not (moving and self._behavior.pinned and self._due(frame)):
+    def _park(self, image: NDArray[np.uint8], frame: Frame) -> bool:
+        """Look whether the end is still ahead, and arrive there; tells whether a network ran."""
+        if float(self._motion.speed_mps[0]) <= 0.0:
+            self._stand()
+            return False
+        if not self._due(frame):
             return False
         try:
             self._berth.look(self._behavior.unlike_goal_in(image))
         except ModelError:
-            return False  # where it was to stand still holds
+            self._machine.update(Events(fault=Reason.MODEL_FAULT))
+            return False
         self._saw(frame)
         self._waypoint_m = self._berth.place_m
         return True
+
+    def _stand(self) -> None:
+        """Having come to stand, arrive if this is the end."""
+        self._berth.taken = False
+        self._done_ticks = 0
+        if self._berth.held_up:
+            return  # by an obstacle: it goes on
+        if self._berth.lowest <= self._config.lost.unlike_rest:
+            self._machine.update(Events(arrived=True))
+        else:
+            self._lose()
 
     def _lose(self) -> None:
         """Stand, and look for the place."""
@@ -370,6 +383,7 @@ class Follower:
     def _join(self, hypothesis: Hypothesis) -> None:
         """Go on with a behavior that the robot was found to be on."""
         self._behavior, self._belief = hypothesis.behavior, hypothesis.belief
+        self._berth.taken = False
         self._done_ticks = 0
         self._age_steps = 0
         self._machine.update(Events(found=True))
@@ -379,6 +393,7 @@ class Follower:
         self._behavior = Behavior(self._networks, self._route, segment)
         if self._prediction is not None:  # what it said of the segment left behind
             self._prediction = replace(self._prediction, progress=0.0)
+        self._berth.taken = False
         self._done_ticks = 0
         self._age_steps = 0
 
@@ -395,7 +410,7 @@ class Follower:
     def _move(self, ranges_m: NDArray[np.float64] | None, now_s: float) -> None:
         """Set the motion commanded for this step."""
         state = self._machine.state
-        driving = state in {State.FOLLOWING, State.ARRIVED, State.JOINING}
+        driving = state in {State.FOLLOWING, State.JOINING}
         if not driving or ranges_m is None or self._waypoint_m is None:
             # The command is zero at once; the estimate follows the robot's own braking.
             braked = self._motion.speed_mps - self._robot.max_braking_mps2 * STEP_S
@@ -403,7 +418,7 @@ class Follower:
             self._command = (0.0, 0.0)
         else:
             scan_m = ranges_m[None]  # (1, rays)
-            if state is State.ARRIVED:
+            if state is State.FOLLOWING and self._berth.taken:
                 motion = self._berth.step(self._motion)
             else:
                 goal_m = np.array([self._waypoint_m])  # (1, 2)
@@ -429,7 +444,7 @@ class Follower:
         y = self._waypoint_m[1] - travel_m * math.sin(0.5 * turn_rad)
         cos, sin = math.cos(turn_rad), math.sin(turn_rad)
         self._waypoint_m = (cos * x + sin * y, cos * y - sin * x)
-        if self._machine.state is State.ARRIVED:
+        if self._berth.taken:
             self._berth.carry(self._waypoint_m, travel_m, turn_rad)
 
     def _decision(self, observation: Observation, now_s: float, ticked: bool) -> Decision:

@@ -12,7 +12,7 @@ from cbe_runtime.berth import Berth, BerthConfig
 def driven_m(read_m, unlike):
     """How far it drives from where the end was read `read_m` ahead; `unlike` is of the distance."""
     berth = Berth(Robot(), BerthConfig())
-    berth.choose(np.array([read_m, 0.0, 0.0]), unlike(0.0))
+    berth.take(np.array([read_m, 0.0, 0.0]), unlike(0.0))
     motion, x_m = Motion(np.array([0.5]), np.zeros(1)), 0.0
     for step in range(100):
         motion = berth.step(motion)
@@ -44,10 +44,10 @@ def test_view_that_gets_more_alike_for_ever_does_not_lead_astray():
     assert driven_m(0.2, lambda x_m: 1.0 - 0.3 * x_m) < REACH_M + 0.2
 
 
-def test_arriving_again_begins_anew():
+def test_parking_again_begins_anew():
     berth = Berth(Robot(), BerthConfig())
     for _ in range(2):
-        berth.choose(np.array([0.02, 0.0, 0.0]), 0.3)
+        berth.take(np.array([0.02, 0.0, 0.0]), 0.3)
         berth.carry((-0.03, 0.0), 0.05, 0.0)
         berth.look(0.2)
         assert berth.place_m == (BerthConfig().ahead_m, 0.0)

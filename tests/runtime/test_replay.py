@@ -26,7 +26,7 @@ blackdrive = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(blackdrive)
 
 # The tiny networks say nothing of sense about places: never lost.
-NEVER_LOST = FollowerConfig(lost=LostConfig(usual=-50.0, unlike_end=99.0))
+NEVER_LOST = FollowerConfig(lost=LostConfig(usual=-50.0, unlike_end=99.0, unlike_rest=99.0))
 
 
 @pytest.fixture(scope="module")
