@@ -22,6 +22,7 @@ class BerthConfig:
 
     nearing: float = 0.004  # unlikeness that a view must be below all before to be nearer
     past: float = 0.012  # above the lowest: the end lies behind
+    well_past: float = 0.04  # likewise, even if it was read farther on
     looks: int = 2  # in a row that are not nearer, likewise
     ahead_m: float = 0.05  # the end is held to be so far ahead: it creeps on
     held_up_m: float = 0.1
@@ -70,7 +71,7 @@ class Berth:
         past = unlike > self.lowest + self._config.past
         self._vain = 0 if nearer else self._vain + (self._config.looks if past else 1)
         self.lowest = min(self.lowest, unlike)
-        if self._beyond and not self._ahead:
+        if (self._beyond and not self._ahead) or unlike > self.lowest + self._config.well_past:
             self.pose[0] = min(self.pose[0], 0.0)
 
     @property

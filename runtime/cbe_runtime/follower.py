@@ -43,6 +43,8 @@ class FollowerConfig:
     arrival_steps: float = 6.4  # no more is left: 0.95 of 256 steps is still 0.6 m from the end
     resting_progress: float = 0.85  # enough where the waypoint says that the end is here:
     resting_range_m: float = 0.05  # a progress that stalls below the threshold must not strand it
+    seen_unlike: float = 0.25  # or where the view is like the end's, and
+    seen_range_m: float = 0.6  # that is seen so near
     progress_ticks: int = 2  # network ticks in a row that must agree, against flicker
     timeout_factor: float = 3.0  # a segment may take this many times the demonstration's steps
     timeout_steps: int = 100  # ... and this many more
@@ -58,6 +60,15 @@ class FollowerConfig:
             return True
         range_m = math.hypot(*prediction.waypoint_m) - OVERRUN_M
         return progress >= self.resting_progress and range_m < self.resting_range_m
+
+    def sees_end(self, prediction: Prediction, unlike: float, range_m: float) -> bool:
+        """Whether the route's end is in sight, so that it can be parked in.
+
+        It may be right before a wall: heading for the waypoint, which runs on past it, the robot
+        would dodge that.
+        """
+        near = range_m <= self.seen_range_m and unlike <= self.seen_unlike
+        return near and prediction.progress >= self.resting_progress
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,19 +302,21 @@ class Follower:
     def _judge_progress(self, prediction: Prediction) -> None:
         """Start the next behavior, or arrive, once enough ticks in a row say so."""
         last = self._behavior.last
+        unlike, rest = self._behavior.unlike_goal, self._end(prediction)
+        range_m = math.hypot(rest[0], rest[1])
         done = self._config.ends(prediction, self._behavior.steps, last=last)
+        if last and self._behavior.pinned and not done:
+            done = self._config.sees_end(prediction, unlike, range_m)
         self._done_ticks = self._done_ticks + 1 if done else 0
         if self._done_ticks < self._config.progress_ticks:
             return
-        rest = self._end(prediction)
-        near = math.hypot(rest[0], rest[1]) <= REACH_M
-        as_remembered = near and self._behavior.unlike_goal <= self._config.lost.unlike_end
+        as_remembered = range_m <= REACH_M and unlike <= self._config.lost.unlike_end
         if not as_remembered:
             self._belief.contradict()
         if not last:
             self._begin(self._behavior.segment + 1)
         elif as_remembered:
-            self._berth.take(rest, self._behavior.unlike_goal)
+            self._berth.take(rest, unlike)
             self._waypoint_m = self._berth.place_m
 
     def _end(self, prediction: Prediction) -> NDArray[np.float64]:

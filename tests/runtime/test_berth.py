@@ -36,6 +36,11 @@ def test_drives_on_to_an_end_that_was_read_too_near(end_m):
     assert stood_m == pytest.approx(end_m, abs=0.15)
 
 
+def test_does_not_drive_past_an_end_that_was_read_too_far():
+    stood_m = driven_m(0.8, lambda x_m: 0.1 + 0.3 * abs(x_m - 0.3))
+    assert stood_m == pytest.approx(0.4, abs=0.15)
+
+
 def test_view_that_does_not_change_says_nothing():
     assert driven_m(0.2, lambda x_m: 0.2) == pytest.approx(0.2, abs=0.05)
 

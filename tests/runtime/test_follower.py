@@ -136,8 +136,22 @@ def _saying(drive, monkeypatch, segment=1, **said):
 def test_stalled_progress_arrives_only_where_the_waypoint_says_rest(
     drive, monkeypatch, progress, waypoint_x_m, state
 ):
-    _saying(drive, monkeypatch, progress=progress, waypoint_m=np.array([waypoint_x_m, 0.0]))
-    assert drive.step(20).state is state
+    waypoint_m, end = np.array([waypoint_x_m, 0.0]), np.array([0.8, 0.0, 1.0, 0.0])
+    _saying(drive, monkeypatch, progress=progress, waypoint_m=waypoint_m, end=end)
+    assert drive.step(40).state is state
+
+
+@pytest.mark.parametrize(
+    ("progress", "end_x_m", "unlike", "parks"),
+    [(0.9, 0.4, 0.2, True), (0.7, 0.4, 0.2, False), (0.9, 0.8, 0.2, False), (0.9, 0.4, 0.3, False)],
+)
+def test_parks_early_only_where_the_end_is_in_sight(
+    drive, monkeypatch, progress, end_x_m, unlike, parks
+):
+    _saying(drive, monkeypatch, progress=progress, end=np.array([end_x_m, 0.0, 1.0, 0.0]))
+    monkeypatch.setattr(Behavior, "unlike_goal", unlike)
+    drive.step(6)
+    assert drive.follower._berth.taken is parks
 
 
 def test_stalled_progress_switches_where_the_waypoint_says_rest(drive, monkeypatch):
@@ -183,8 +197,8 @@ def test_end_seen_to_one_side_is_turned_to_though_the_waypoint_is_straight_ahead
 
 def test_robot_that_stands_where_nothing_looks_like_the_end_is_lost(drive, monkeypatch):
     _parks(drive)
-    monkeypatch.setattr(Behavior, "unlike_goal_in", lambda self, image: 0.3)
-    drive.follower._berth.lowest = 0.3
+    monkeypatch.setattr(Behavior, "unlike_goal_in", lambda self, image: 0.32)
+    drive.follower._berth.lowest = 0.32
     states = [drive.step().state for _ in range(20)]
     assert State.LOST in states
     assert State.ARRIVED not in states
