@@ -1,11 +1,14 @@
 """Long routes are carried by processes of their own; their files grow with their length alone."""
 
 import json
+import math
 
 import pytest
 
+from cbe.robot import STEP_S, Robot
 from cbe_bench import long
 from cbe_bench.cli import main
+from cbe_runtime.networks import Networks
 
 
 def test_file_grows_with_the_length_and_little_else(tmp_path, monkeypatch, capsys) -> None:
@@ -15,7 +18,9 @@ def test_file_grows_with_the_length_and_little_else(tmp_path, monkeypatch, capsy
     assert main(["long", "--length-m", "400", "--precision", "u4", "--json", str(path)]) == 0
     short, far = json.loads(path.read_text())["lengths"]
     assert (short["length_m"], far["length_m"]) == (20.0, 400.0)
-    assert far["segments"] == 20 * short["segments"]
+    longest = Networks.load().segment_steps
+    steps = [round(length_m / STEP_S / Robot().max_speed_mps) for length_m in (20.0, 400.0)]
+    assert [row["segments"] for row in (short, far)] == [math.ceil(n / longest) for n in steps]
     assert far["bytes"] < 20 * short["bytes"]
     assert far["teaching_mib"] < 5.0
     assert far["memory_mib"] - short["memory_mib"] < 5.0
