@@ -14,7 +14,7 @@ from cbe.errors import CbeError
 from cbe.robot import STEP_S
 from cbe_bench.place import See
 from cbe_hil_sim.backend import Backend
-from cbe_runtime.follower import Decision
+from cbe_runtime.decision import Decision
 from cbe_runtime.observation import Frame, Observation, Scan
 from cbe_runtime.state import Reason, State
 

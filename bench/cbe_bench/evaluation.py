@@ -20,7 +20,8 @@ from cbe_bench.place import BACKENDS, Bin, Place, is_scene, world_seeds
 from cbe_bench.scenario import BIN_MARGIN_SAMPLES, GROUP, Scenario, Terms, scenarios
 from cbe_bench.tally import Record, summary
 from cbe_runtime import routefile
-from cbe_runtime.follower import Follower, FollowerConfig
+from cbe_runtime.follower import Follower
+from cbe_runtime.followerconfig import FollowerConfig
 from cbe_runtime.networks import PACKAGED_MODELS, Networks
 from cbe_runtime.route import Route
 

@@ -20,7 +20,7 @@ from cbe_bench.faultlist import Fault, Shot
 from cbe_bench.place import See
 from cbe_hil_sim.backend import Backend
 from cbe_hil_sim.process import DEADMAN_S, INFO_STEPS
-from cbe_runtime.follower import Decision
+from cbe_runtime.decision import Decision
 from cbe_runtime.loop import OLD_DECISION_S
 from cbe_runtime.pace import Ratekeeper
 from cbe_runtime.sensors import Sensors

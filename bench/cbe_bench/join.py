@@ -19,7 +19,8 @@ from cbe_bench.route import Teaching
 from cbe_bench.tally import wilson
 from cbe_hil_sim.world import World
 from cbe_hil_sim.worldbatch import WorldBatch
-from cbe_runtime.follower import Decision, Follower
+from cbe_runtime.decision import Decision
+from cbe_runtime.follower import Follower
 from cbe_runtime.networks import Networks
 from cbe_runtime.observation import Observation
 from cbe_runtime.route import Route

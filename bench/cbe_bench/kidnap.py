@@ -19,7 +19,9 @@ from cbe_bench.place import Place
 from cbe_bench.route import Teaching
 from cbe_bench.tally import wilson
 from cbe_hil_sim.demonstrator import ENDPOINT_CLEARANCE_M
-from cbe_runtime.follower import Decision, Follower, FollowerConfig
+from cbe_runtime.decision import Decision
+from cbe_runtime.follower import Follower
+from cbe_runtime.followerconfig import FollowerConfig
 from cbe_runtime.networks import Networks
 from cbe_runtime.state import State
 

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import Self
 
-    from cbe_runtime.follower import Decision, Follower
+    from cbe_runtime.decision import Decision
+    from cbe_runtime.follower import Follower
     from cbe_runtime.route import Route
 
 logger = logging.getLogger(__name__)

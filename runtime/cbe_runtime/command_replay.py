@@ -31,8 +31,9 @@ from cbe_runtime.retrace import moments, retrace
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from cbe_runtime.decision import Decision
     from cbe_runtime.decisionlog import DecisionRecord, Settings
-    from cbe_runtime.follower import Decision, FollowerConfig
+    from cbe_runtime.followerconfig import FollowerConfig
     from cbe_runtime.route import Route
 
 logger = logging.getLogger(__name__)

@@ -19,7 +19,8 @@ from cbe.topics import FRESH_S
 from cbe_runtime import options as shared
 from cbe_runtime import routefile, scheduling
 from cbe_runtime.bookmark import SUFFIX, Bookmark
-from cbe_runtime.follower import Follower, FollowerConfig
+from cbe_runtime.follower import Follower
+from cbe_runtime.followerconfig import FollowerConfig
 from cbe_runtime.linkkeeper import LinkKeeper
 from cbe_runtime.loop import Loop, LoopConfig
 from cbe_runtime.networks import Networks

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from cbe_runtime.decisionlog import differing
 
 if TYPE_CHECKING:
-    from cbe_runtime.follower import Decision
+    from cbe_runtime.decision import Decision
     from cbe_runtime.retrace import Moment, Retraced
 
 

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 
 from cbe_runtime import carried, routefile
-from cbe_runtime.follower import Asked, Decision, FollowerConfig
+from cbe_runtime.decision import Asked, Decision
+from cbe_runtime.followerconfig import FollowerConfig
 
 if TYPE_CHECKING:
     from cbe.camera import CameraModel

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,10 +16,12 @@ from cbe.robot import STEP_S, Robot
 from cbe.signature import OVERRUN_M
 from cbe.stop_zone import limit
 from cbe_runtime.behavior import Behavior
-from cbe_runtime.berth import Berth, BerthConfig
+from cbe_runtime.berth import Berth
 from cbe_runtime.caution import slowed
-from cbe_runtime.joining import JoinConfig, Search, Whereabouts, advice
-from cbe_runtime.lost import LostBelief, LostConfig
+from cbe_runtime.decision import Asked, Decision
+from cbe_runtime.followerconfig import FollowerConfig
+from cbe_runtime.joining import Search, Whereabouts, advice
+from cbe_runtime.lost import LostBelief
 from cbe_runtime.observation import Observation, StampWatch, newer, usable_image, usable_ranges
 from cbe_runtime.plausible import PictureWatch, ReturnWatch
 from cbe_runtime.state import Events, Reason, State, StateMachine
@@ -31,87 +33,6 @@ if TYPE_CHECKING:
     from cbe_runtime.networks import Networks, Prediction
     from cbe_runtime.observation import Frame
     from cbe_runtime.route import Route
-
-
-@dataclass(frozen=True, slots=True)
-class FollowerConfig:
-    """How the follower switches, arrives and gives up."""
-
-    fresh_s: float = 0.3  # an older image or scan stops the robot
-    switch_progress: float = 0.95  # phi >= 0.95 starts the next behavior, Sec. III-D
-    arrival_progress: float = 0.95  # the same on the last behavior means ARRIVED, where
-    arrival_steps: float = 6.4  # no more is left: 0.95 of 256 steps is still 0.6 m from the end
-    resting_progress: float = 0.85  # enough where the waypoint says that the end is here:
-    resting_range_m: float = 0.05  # a progress that stalls below the threshold must not strand it
-    seen_unlike: float = 0.25  # or where the view is like the end's, and
-    seen_range_m: float = 0.6  # that is seen so near
-    progress_ticks: int = 2  # network ticks in a row that must agree, against flicker
-    timeout_factor: float = 3.0  # a segment may take this many times the demonstration's steps
-    timeout_steps: int = 100  # ... and this many more
-    lost: LostConfig = field(default_factory=LostConfig)
-    join: JoinConfig = field(default_factory=JoinConfig)
-    berth: BerthConfig = field(default_factory=BerthConfig)
-
-    def ends(self, prediction: Prediction, steps: int, *, last: bool) -> bool:
-        """Whether a tick says that a behavior of so many steps, a route's last or not, is done."""
-        progress = prediction.progress
-        arrival = max(self.arrival_progress, 1.0 - self.arrival_steps / steps)
-        if progress >= (arrival if last else self.switch_progress):
-            return True
-        range_m = math.hypot(*prediction.waypoint_m) - OVERRUN_M
-        return progress >= self.resting_progress and range_m < self.resting_range_m
-
-    def sees_end(self, prediction: Prediction, unlike: float, range_m: float) -> bool:
-        """Whether the route's end is in sight, so that it can be parked in.
-
-        It may be right before a wall: heading for the waypoint, which runs on past it, the robot
-        would dodge that.
-        """
-        near = range_m <= self.seen_range_m and unlike <= self.seen_unlike
-        return near and prediction.progress >= self.resting_progress
-
-
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """What was asked of the follower between two steps.
-
-    `relocalise` is a start anywhere on the route, `near` where the robot is thought to be.
-    """
-
-    start: bool = False
-    stop: bool = False
-    relocalise: bool = False
-    near: Whereabouts | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Decision:
-    """What to command in this step, and why.
-
-    `progress` is of the present segment; `waypoint_m` (x, y) in base_link at the present pose;
-    ages are since receipt, inf where nothing was received; `standing` is the robot's own belief
-    (the command and the braking that precedes it), `ticked` whether the networks ran. `lost` is
-    the probability of being lost, `place` where the robot most likely is, if that is known.
-    `gap_steps` is how many steps the robot may have driven between the last two frames that the
-    networks saw: they are trained on 1 to 3.
-    """
-
-    speed_mps: float
-    yaw_rate_rad_s: float
-    state: State
-    reason: Reason | None
-    segment: int
-    segments: int
-    progress: float
-    on_route: float
-    waypoint_m: tuple[float, float] | None
-    camera_age_s: float
-    scan_age_s: float
-    standing: bool
-    ticked: bool
-    lost: float = 0.0
-    place: Whereabouts | None = None
-    gap_steps: int = 0
 
 
 class Follower:

@@ -9,7 +9,7 @@ import numpy as np
 
 from cbe.errors import RouteError
 from cbe_runtime.behavior import Behavior
-from cbe_runtime.follower import FollowerConfig
+from cbe_runtime.followerconfig import FollowerConfig
 from cbe_runtime.likeness import unlikeness
 from cbe_runtime.perturb import PERTURBATIONS, as_it_is
 

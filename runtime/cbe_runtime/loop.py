@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from threading import Event
 
     from cbe.link import Link
-    from cbe_runtime.follower import Decision, Follower
+    from cbe_runtime.decision import Decision
+    from cbe_runtime.follower import Follower
     from cbe_runtime.observation import Observation
     from cbe_runtime.sensors import Sensors
 

@@ -16,7 +16,7 @@ from cbe.errors import CameraError, ConfigError
 from cbe.linkconfig import LOOPBACK, LinkConfig, loopback
 from cbe.linkoptions import add_security, security
 from cbe.topics import KeyStyle
-from cbe_runtime.follower import FollowerConfig
+from cbe_runtime.followerconfig import FollowerConfig
 from cbe_runtime.networks import PACKAGED_MODELS
 from cbe_runtime.route import AttractorPrecision, EmbeddingPrecision
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from cbe.messages import CompressedImage, Image
-    from cbe_runtime.follower import Decision
+    from cbe_runtime.decision import Decision
     from cbe_runtime.observation import Observation
 
 Colour = tuple[int, int, int]  # BGR

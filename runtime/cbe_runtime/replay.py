@@ -22,8 +22,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from cbe.messages import CompressedImage, Image
+    from cbe_runtime.decision import Decision
     from cbe_runtime.drive import RecordedDrive
-    from cbe_runtime.follower import Decision, Follower
+    from cbe_runtime.follower import Follower
 
 logger = logging.getLogger(__name__)
 

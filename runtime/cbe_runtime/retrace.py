@@ -16,7 +16,7 @@ from cbe.rays import resample
 from cbe_runtime import carried
 from cbe_runtime.decisionlog import DecisionRecord, Seen, checksum, differing, parse
 from cbe_runtime.drive import IMAGE_TYPES
-from cbe_runtime.follower import FollowerConfig
+from cbe_runtime.followerconfig import FollowerConfig
 from cbe_runtime.observation import Frame, Observation, Scan
 from cbe_runtime.view import View
 
@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 
     from cbe.messages import CompressedImage, Image
     from cbe.robot import Robot
-    from cbe_runtime.follower import Decision, Follower
+    from cbe_runtime.decision import Decision
+    from cbe_runtime.follower import Follower
     from cbe_runtime.mcapfile import Recorded
 
 logger = logging.getLogger(__name__)

@@ -11,7 +11,7 @@ from cbe.errors import CbeError
 from cbe_bench.episode import Outcome, film, ride
 from cbe_hil_sim.backend import Observation as Seen
 from cbe_hil_sim.vehicle import Vehicle
-from cbe_runtime.follower import Decision
+from cbe_runtime.decision import Decision
 from cbe_runtime.observation import Observation
 from cbe_runtime.state import Reason, State
 

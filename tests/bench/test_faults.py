@@ -18,7 +18,8 @@ from cbe_bench.faultride import FaultyRide, ride
 from cbe_bench.faults import _tally
 from cbe_hil_sim.backend import Observation as Seen
 from cbe_hil_sim.vehicle import Vehicle
-from cbe_runtime.follower import Decision, Follower
+from cbe_runtime.decision import Decision
+from cbe_runtime.follower import Follower
 from cbe_runtime.networks import Networks, Prediction
 from cbe_runtime.state import State
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 import pytest
 
 from cbe_runtime.bookmark import EVERY_STEPS, Bookmark
-from cbe_runtime.follower import Decision
+from cbe_runtime.decision import Decision
 from cbe_runtime.state import State
 
 DEADLINE_S = 30.0

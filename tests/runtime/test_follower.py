@@ -8,7 +8,8 @@ from cbe.errors import ModelError, RouteError
 from cbe.robot import STEP_S, Robot
 from cbe.signature import OVERRUN_M
 from cbe_runtime.behavior import Behavior
-from cbe_runtime.follower import Follower, FollowerConfig
+from cbe_runtime.follower import Follower
+from cbe_runtime.followerconfig import FollowerConfig
 from cbe_runtime.networks import Networks
 from cbe_runtime.observation import Frame, Observation, Scan
 from cbe_runtime.state import Reason, State

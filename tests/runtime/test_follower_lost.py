@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from cbe.robot import STEP_S, Robot
-from cbe_runtime.follower import Follower, FollowerConfig
+from cbe_runtime.follower import Follower
+from cbe_runtime.followerconfig import FollowerConfig
 from cbe_runtime.joining import Whereabouts
 from cbe_runtime.networks import Networks
 from cbe_runtime.observation import Frame, Observation, Scan

@@ -15,7 +15,8 @@ from cbe.inbox import Latest
 from cbe.messages import CameraInfo
 from cbe.rays import scan_message
 from cbe.robot import Robot
-from cbe_runtime.follower import Follower, FollowerConfig
+from cbe_runtime.follower import Follower
+from cbe_runtime.followerconfig import FollowerConfig
 from cbe_runtime.loop import EXIT_STOPPED, Loop, LoopConfig
 from cbe_runtime.observation import Observation
 from cbe_runtime.pace import WINDOW_S, LockStep, Ratekeeper

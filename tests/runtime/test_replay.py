@@ -13,7 +13,8 @@ from cbe.robot import Robot
 from cbe_runtime import carried, cli, routefile
 from cbe_runtime.comparison import Comparison, Tolerance
 from cbe_runtime.decisionlog import parse
-from cbe_runtime.follower import Follower, FollowerConfig
+from cbe_runtime.follower import Follower
+from cbe_runtime.followerconfig import FollowerConfig
 from cbe_runtime.lost import LostConfig
 from cbe_runtime.mcapfile import Recorder
 from cbe_runtime.networks import Networks

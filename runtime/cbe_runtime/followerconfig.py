@@ -1,0 +1,53 @@
+"""When the follower switches, parks, arrives and gives up: every figure of it in one place."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from cbe.signature import OVERRUN_M
+from cbe_runtime.berth import BerthConfig
+from cbe_runtime.joining import JoinConfig
+from cbe_runtime.lost import LostConfig
+
+if TYPE_CHECKING:
+    from cbe_runtime.networks import Prediction
+
+
+@dataclass(frozen=True, slots=True)
+class FollowerConfig:
+    """How the follower switches, arrives and gives up."""
+
+    fresh_s: float = 0.3  # an older image or scan stops the robot
+    switch_progress: float = 0.95  # phi >= 0.95 starts the next behavior, Sec. III-D
+    arrival_progress: float = 0.95  # the same on the last behavior means ARRIVED, where
+    arrival_steps: float = 6.4  # no more is left: 0.95 of 256 steps is still 0.6 m from the end
+    resting_progress: float = 0.85  # enough where the waypoint says that the end is here:
+    resting_range_m: float = 0.05  # a progress that stalls below the threshold must not strand it
+    seen_unlike: float = 0.25  # or where the view is like the end's, and
+    seen_range_m: float = 0.6  # that is seen so near
+    progress_ticks: int = 2  # network ticks in a row that must agree, against flicker
+    timeout_factor: float = 3.0  # a segment may take this many times the demonstration's steps
+    timeout_steps: int = 100  # ... and this many more
+    lost: LostConfig = field(default_factory=LostConfig)
+    join: JoinConfig = field(default_factory=JoinConfig)
+    berth: BerthConfig = field(default_factory=BerthConfig)
+
+    def ends(self, prediction: Prediction, steps: int, *, last: bool) -> bool:
+        """Whether a tick says that a behavior of so many steps, a route's last or not, is done."""
+        progress = prediction.progress
+        arrival = max(self.arrival_progress, 1.0 - self.arrival_steps / steps)
+        if progress >= (arrival if last else self.switch_progress):
+            return True
+        range_m = math.hypot(*prediction.waypoint_m) - OVERRUN_M
+        return progress >= self.resting_progress and range_m < self.resting_range_m
+
+    def sees_end(self, prediction: Prediction, unlike: float, range_m: float) -> bool:
+        """Whether the route's end is in sight, so that it can be parked in.
+
+        It may be right before a wall: heading for the waypoint, which runs on past it, the robot
+        would dodge that.
+        """
+        near = range_m <= self.seen_range_m and unlike <= self.seen_unlike
+        return near and prediction.progress >= self.resting_progress
