@@ -222,22 +222,22 @@ class Follower:
 
     def _judge_progress(self, prediction: Prediction) -> None:
         """Start the next behavior, or arrive, once enough ticks in a row say so."""
-        last = self._behavior.last
-        unlike, rest = self._behavior.unlike_goal, self._end(prediction)
+        config, behavior, last = self._config, self._behavior, self._behavior.last
+        rest = self._end(prediction)
         range_m = math.hypot(rest[0], rest[1])
-        done = self._config.ends(prediction, self._behavior.steps, last=last)
-        if last and self._behavior.pinned and not done:
-            done = self._config.sees_end(prediction, unlike, range_m)
+        done = config.ends(prediction, behavior.steps, last=last)
+        if not done and last and behavior.pinned and config.may_see_end(prediction, range_m):
+            done = behavior.unlike_goal <= config.seen_unlike
         self._done_ticks = self._done_ticks + 1 if done else 0
-        if self._done_ticks < self._config.progress_ticks:
+        if self._done_ticks < config.progress_ticks:
             return
-        as_remembered = range_m <= REACH_M and unlike <= self._config.lost.unlike_end
+        as_remembered = range_m <= REACH_M and behavior.unlike_goal <= config.lost.unlike_end
         if not as_remembered:
             self._belief.contradict()
         if not last:
-            self._begin(self._behavior.segment + 1)
+            self._begin(behavior.segment + 1)
         elif as_remembered:
-            self._berth.take(rest, unlike)
+            self._berth.take(rest, behavior.unlike_goal)
             self._waypoint_m = self._berth.place_m
 
     def _end(self, prediction: Prediction) -> NDArray[np.float64]:

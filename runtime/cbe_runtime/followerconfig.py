@@ -21,12 +21,12 @@ class FollowerConfig:
 
     fresh_s: float = 0.3  # an older image or scan stops the robot
     switch_progress: float = 0.95  # phi >= 0.95 starts the next behavior, Sec. III-D
-    arrival_progress: float = 0.95  # the same on the last behavior means ARRIVED, where
+    arrival_progress: float = 0.95  # the same on the last behavior begins to park, where
     arrival_steps: float = 6.4  # no more is left: 0.95 of 256 steps is still 0.6 m from the end
     resting_progress: float = 0.85  # enough where the waypoint says that the end is here:
     resting_range_m: float = 0.05  # a progress that stalls below the threshold must not strand it
-    seen_unlike: float = 0.25  # or where the view is like the end's, and
-    seen_range_m: float = 0.6  # that is seen so near
+    seen_unlike: float = 0.25  # or where the last view is as like the end's as that, and
+    seen_range_m: float = 0.6  # the end is read to be so near
     progress_ticks: int = 2  # network ticks in a row that must agree, against flicker
     timeout_factor: float = 3.0  # a segment may take this many times the demonstration's steps
     timeout_steps: int = 100  # ... and this many more
@@ -43,11 +43,10 @@ class FollowerConfig:
         range_m = math.hypot(*prediction.waypoint_m) - OVERRUN_M
         return progress >= self.resting_progress and range_m < self.resting_range_m
 
-    def sees_end(self, prediction: Prediction, unlike: float, range_m: float) -> bool:
-        """Whether the route's end is in sight, so that it can be parked in.
+    def may_see_end(self, prediction: Prediction, range_m: float) -> bool:
+        """Whether a view like the end's, read to be so near, is the end to park in.
 
         It may be right before a wall: heading for the waypoint, which runs on past it, the robot
         would dodge that.
         """
-        near = range_m <= self.seen_range_m and unlike <= self.seen_unlike
-        return near and prediction.progress >= self.resting_progress
+        return prediction.progress >= self.resting_progress and range_m <= self.seen_range_m
