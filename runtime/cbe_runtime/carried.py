@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from cbe_runtime.follower import Follower
 
 CONSTANT = frozenset({"_networks", "_route", "_robot", "_config", "_controller", "_parking"})
-FLEETING = frozenset({"_asking", "asked", "_search"})
+FLEETING = frozenset({"_asking", "asked", "_search", "_ranges_m"})
 """Empty between two steps, or at the beginning of a behavior."""
 OURS = ("cbe.", "cbe_runtime.")
 MAX_ARRAY_BYTES = 2**20

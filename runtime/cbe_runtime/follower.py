@@ -35,6 +35,10 @@ if TYPE_CHECKING:
     from cbe_runtime.route import Route
 
 
+AHEAD_RAD = math.radians(20.0)
+"""To each side, what is straight ahead."""
+
+
 class Follower:
     """Drives one robot along one route, a behavior at a time.
 
@@ -81,6 +85,7 @@ class Follower:
         self._seen_stamp_ns: int | None = None
         self._prediction: Prediction | None = None
         self._waypoint_m: tuple[float, float] | None = None  # at the present pose
+        self._ranges_m: NDArray[np.float64] | None = None  # of the present step
 
     @property
     def model_id(self) -> str:
@@ -130,6 +135,7 @@ class Follower:
         self.asked = asked = self._take_asked()
         self._carry_waypoint()
         image, ranges_m, fault = self._judge(observation, now_s)
+        self._ranges_m = ranges_m
         before = self._machine.state
         if asked.start and before not in {State.FOLLOWING, State.STOPPED}:
             self._restart()
@@ -227,7 +233,8 @@ class Follower:
         range_m = math.hypot(rest[0], rest[1])
         done = config.ends(prediction, behavior.steps, last=last)
         if not done and last and behavior.pinned and config.may_see_end(prediction, range_m):
-            done = behavior.unlike_goal <= config.seen_unlike
+            walled = self._free_ahead_m() <= config.walled_m
+            done = walled and behavior.unlike_goal <= config.seen_unlike
         self._done_ticks = self._done_ticks + 1 if done else 0
         if self._done_ticks < config.progress_ticks:
             return
@@ -239,6 +246,14 @@ class Follower:
         elif as_remembered:
             self._berth.take(rest, behavior.unlike_goal)
             self._waypoint_m = self._berth.place_m
+
+    def _free_ahead_m(self) -> float:
+        """Range of the nearest return straight ahead of the lidar, inf without one."""
+        if self._ranges_m is None:
+            return math.inf
+        half = round(AHEAD_RAD / self._robot.scan_angle_increment_rad)
+        middle = len(self._ranges_m) // 2
+        return float(np.fmin.reduce(self._ranges_m[middle - half : middle + half]))
 
     def _end(self, prediction: Prediction) -> NDArray[np.float64]:
         """The behavior's last pose (3,) in base_link, as the view shows it."""

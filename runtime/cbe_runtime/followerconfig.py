@@ -25,7 +25,8 @@ class FollowerConfig:
     arrival_steps: float = 6.4  # no more is left: 0.95 of 256 steps is still 0.6 m from the end
     resting_progress: float = 0.85  # enough where the waypoint says that the end is here:
     resting_range_m: float = 0.05  # a progress that stalls below the threshold must not strand it
-    seen_unlike: float = 0.25  # or where the last view is as like the end's as that, and
+    walled_m: float = 1.0  # or, something standing so near ahead, where the last view is
+    seen_unlike: float = 0.25  # as like the end's as that, and
     seen_range_m: float = 0.6  # the end is read to be so near
     progress_ticks: int = 2  # network ticks in a row that must agree, against flicker
     timeout_factor: float = 3.0  # a segment may take this many times the demonstration's steps
@@ -46,7 +47,7 @@ class FollowerConfig:
     def may_see_end(self, prediction: Prediction, range_m: float) -> bool:
         """Whether a view like the end's, read to be so near, is the end to park in.
 
-        It may be right before a wall: heading for the waypoint, which runs on past it, the robot
-        would dodge that.
+        That is asked where the end may be right before a wall: heading for the waypoint, which
+        runs on past it, the robot would dodge that.
         """
         return prediction.progress >= self.resting_progress and range_m <= self.seen_range_m

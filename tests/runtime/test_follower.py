@@ -143,15 +143,22 @@ def test_stalled_progress_arrives_only_where_the_waypoint_says_rest(
 
 
 @pytest.mark.parametrize(
-    ("progress", "end_x_m", "unlike", "parks"),
-    [(0.9, 0.4, 0.2, True), (0.7, 0.4, 0.2, False), (0.9, 0.8, 0.2, False), (0.9, 0.4, 0.3, False)],
+    ("progress", "end_x_m", "unlike", "ahead_m", "parks"),
+    [
+        (0.9, 0.4, 0.2, 0.8, True),
+        (0.7, 0.4, 0.2, 0.8, False),
+        (0.9, 0.8, 0.2, 0.8, False),
+        (0.9, 0.4, 0.3, 0.8, False),
+        (0.9, 0.4, 0.2, 3.0, False),
+    ],
 )
-def test_parks_early_only_where_the_end_is_in_sight(
-    drive, monkeypatch, progress, end_x_m, unlike, parks
+def test_parks_early_only_where_the_end_is_in_sight_before_a_wall(
+    drive, monkeypatch, progress, end_x_m, unlike, ahead_m, parks
 ):
     _saying(drive, monkeypatch, progress=progress, end=np.array([end_x_m, 0.0, 1.0, 0.0]))
     monkeypatch.setattr(Behavior, "unlike_goal", unlike)
-    drive.step(6)
+    for _ in range(6):
+        drive.step(scan=drive.scan(np.full_like(OPEN, ahead_m)))
     assert drive.follower._berth.taken is parks
 
 
