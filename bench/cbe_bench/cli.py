@@ -133,8 +133,9 @@ def _parser() -> argparse.ArgumentParser:
 
     card = commands.add_parser("card", help="all figures of the model card, going on where it was")
     card.add_argument(
-        "--folder", type=Path, default=Path("runs/card"), help="of the results (%(default)s)"
-    )
+        "--folder", type=Path, default=Path("runs/card"),
+        help="of the results (%(default)s); begin a new one when more than the model has changed",
+    )  # fmt: skip
     card.add_argument(
         "--only", metavar="TEXT", default="", help="runs whose names contain this, as route or bin"
     )
