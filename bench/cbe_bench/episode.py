@@ -193,7 +193,7 @@ def film(
 ) -> list[NDArray[np.uint8]]:
     """The networks' views from poses (T, 3), as a camera driven along them sees them.
 
-    Only `every` so manyeth is looked from, and the last; between them a view stays as it was.
+    Of each `every` poses the first is looked from, and the last of all; between them a view stays.
     """
     views: list[NDArray[np.uint8]] = []
     for step, pose in enumerate(poses):

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 CONSTANT = frozenset({"_networks", "_route", "_robot", "_config", "_controller", "_parking"})
 FLEETING = frozenset({"_asking", "asked", "_search", "_ranges_m"})
-"""Empty between two steps, or at the beginning of a behavior."""
+"""Empty between two steps or at the beginning of a behavior, or set anew in each step."""
 OURS = ("cbe.", "cbe_runtime.")
 MAX_ARRAY_BYTES = 2**20
 
