@@ -15,8 +15,16 @@ if TYPE_CHECKING:
     from cbe_runtime.route import Route
 
 
+NEARER = 0.004
+"""By so much is a view less unlike another, a tick later, if the robot comes nearer to it."""
+
+
 class Behavior:
-    """Repeats segment `segment` of a route from its first frame on; made anew for each."""
+    """Repeats segment `segment` of a route from its first frame on; made anew for each.
+
+    While the robot comes nearer to where it was shown to begin, every frame is the first one: from
+    0.25 m away that place is read to within 0.12 m, from 0.05 m to within 0.08 m (validation).
+    """
 
     def __init__(self, networks: Networks, route: Route, segment: int) -> None:
         self._networks = networks
@@ -24,6 +32,7 @@ class Behavior:
         self._goal = route.attractor(segment + 1)
         self._embedding_goal = route.embedding(segment)
         self._generator_state = networks.generator_state()
+        self._unlike_start = 0.0  # the first view from the start's, while the robot comes nearer
         self.sight: Sight | None = None  # what was seen last
         self.segment = segment
         self.steps = route.segments[segment].steps
@@ -63,7 +72,19 @@ class Behavior:
         Raises:
             ModelError: an output is not finite; the state is then as before.
         """
-        return self.follow(Sight.of(self._networks, image, self.sight))
+        sight = Sight.of(self._networks, image, self.sight)
+        if sight.begins and self.pinned:
+            self._unlike_start = float(unlikeness(sight.attractor, self._start, 0))
+        elif self._unlike_start > 0.0 and self._is_nearer(sight):
+            sight = Sight.of(self._networks, image, None)
+        return self.follow(sight)
+
+    def _is_nearer(self, sight: Sight) -> bool:
+        """Whether the robot still comes nearer to where the behavior begins; once no, always no."""
+        unlike = float(unlikeness(sight.attractor, self._start, 0))
+        nearer = unlike < self._unlike_start - NEARER
+        self._unlike_start = unlike if nearer else 0.0
+        return nearer
 
     def follow(self, sight: Sight) -> Prediction:
         """One tick of the generator on what the encoder, shared with others, has just seen.
@@ -71,6 +92,7 @@ class Behavior:
         Raises:
             ModelError: an output is not finite; the state is then as before.
         """
+        state = self._networks.generator_state() if sight.begins else self._generator_state
         prediction, self._generator_state = self._networks.generate(
             attractor_now=sight.attractor,
             attractor_first=sight.first,
@@ -78,7 +100,7 @@ class Behavior:
             attractor_goal=self._goal,
             embedding_now=sight.embedding,
             embedding_goal=self._embedding_goal,
-            state=self._generator_state,
+            state=state,
         )
         self.sight = sight
         return prediction

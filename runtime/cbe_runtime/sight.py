@@ -21,6 +21,11 @@ class Sight:
     embedding: NDArray[np.float32]
     state: EncoderState
 
+    @property
+    def begins(self) -> bool:
+        """Whether the frame is the first."""
+        return self.first is self.attractor
+
     @classmethod
     def of(cls, networks: Networks, image: NDArray[np.uint8], before: Sight | None) -> Sight:
         """See the next frame (64, 64, 3) uint8 RGB; the first one where none was seen `before`.

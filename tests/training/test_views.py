@@ -34,6 +34,14 @@ def test_steps_are_as_short_and_as_curved_as_the_robot_drives(drives: Drives) ->
     assert (abs(drawn.motion[:, 2]) <= views.CURVATURE_PER_M * length + 1e-9).all()
 
 
+def test_steps_that_turn_most_are_hardly_longer_than_others(drives: Drives) -> None:
+    motion = views.draw_steps(drives, 600, np.random.default_rng(6)).motion
+    length, turn = np.hypot(motion[:, 0], motion[:, 1]), abs(motion[:, 2])
+    as_in_tight_turns = (turn > 0.16) & (turn < 0.23)
+    assert as_in_tight_turns.sum() > 40
+    assert 0.1 <= length[as_in_tight_turns].mean() < 0.112
+
+
 def test_same_draw_gives_same_views(drives: Drives) -> None:
     one, other = (views.draw(drives, 2, np.random.default_rng(5)) for _ in range(2))
     np.testing.assert_array_equal(one.images, other.images)

@@ -97,7 +97,7 @@ class TrainConfig:
             return 12, 24
         if sequences < self.cloning_sequences + self.annealing_sequences:
             return 20, 40
-        return 36, 136
+        return 24, 136
 
     def expert_share(self, sequences: int) -> float:
         """Probability that a tick is driven by the expert's waypoint."""

@@ -11,12 +11,13 @@ from torch.nn import functional as F
 from cbe import geometry, signature
 from cbe_training.config import LossWeights, TrainConfig
 from cbe_training.layout import pose_of
-from cbe_training.networks import STEP_SCALE, BehaviorNetworks, quantise
+from cbe_training.networks import LOOKAHEAD_M, STEP_SCALE, BehaviorNetworks, quantise
 from cbe_training.policy import Seen, look
 from cbe_training.rollout import Behaviors, Rollouts
 from cbe_training.views import GROUP, NOW, TARGET, Steps, Views
 
 LEVELS = (0, 255, 15, 15)  # attractors stored exactly, at 8 bits, at 4 bits
+TURN_WEIGHT = 4.0  # more of a waypoint straight to the side than of one straight ahead
 OVERLAP_M, OVERLAP_RAD = 2.0, np.radians(60.0)  # beyond, two views share too little
 
 
@@ -131,11 +132,13 @@ def compute(
     # Where the robot is lost there is no right waypoint.
     driving = batch.valid & batch.right[:, None] & (batch.on_route > 0.5)
     error = torch.linalg.vector_norm(out.waypoint_m - batch.waypoint_m, dim=-1)
+    # Tight turns are rare and forgive least: unweighted, their waypoints came out too straight.
+    turning = 1.0 + TURN_WEIGHT * batch.waypoint_m[..., 1].abs() / LOOKAHEAD_M
     related = batch.keep_attractors[batch.memory, 0] > 0.0
     near = _near(batch.goal) & batch.valid & related[:, None]
     pair = torch.ones_like(batch.shown_motion[..., 0], dtype=torch.bool)
     parts = {
-        "waypoint": _mean(error, driving),
+        "waypoint": _mean(error, driving * turning),
         "progress": _mean((out.progress - batch.progress).abs(), driving),
         "on_route": _mean(
             F.binary_cross_entropy_with_logits(

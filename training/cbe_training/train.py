@@ -123,7 +123,7 @@ def iterate(
     # Gaps are mixed: from one gap alone a few updates already make every other look slow or fast.
     for gap, part in ((USUAL_GAP, 2), (int(together.choice(OTHER_GAPS)), 1)):
         count = config.demonstrations // team.size * part // 3
-        drawn = int(together.integers(shortest, longest + 1))
+        drawn = int(shortest * ((longest + 1) / shortest) ** together.random())  # short ones most
         frames.append(min(drawn, config.longest_steps // gap))
         behaviors = show(drives, count, frames[-1], gap, rng)
         rollouts = roll_out(driver, drives, behaviors, config, rng, expert_share=share)

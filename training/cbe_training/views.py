@@ -18,9 +18,11 @@ from cbe_training.rollout import ALIASED, photograph
 GROUP = 6
 AHEAD_STEPS = 40  # views lie up to 2 m further along the drive
 NOT_AHEAD = 0.4  # share of views at the group's first pose
-JITTER_M, JITTER_RAD = 0.3, 0.25
+JITTER_M, JITTER_RAD = 0.3, 0.4
 MOST_JITTER = 1.6
 LONGEST_STEP_M = 0.15  # three steps at full speed
+GAPS = (1, 2, 2, 2, 2, 3)  # steps between two frames, as often as rollouts have them
+AT_FULL_SPEED = 0.7  # share of the pairs
 CURVATURE_PER_M = 2.3  # the vehicle's tightest
 NOW, TARGET = np.nonzero(~np.eye(GROUP, dtype=np.bool_))  # all ordered pairs of a group
 
@@ -55,9 +57,13 @@ def draw(drives: Drives, count: int, rng: np.random.Generator) -> Views:
 
 
 def draw_steps(drives: Drives, count: int, rng: np.random.Generator) -> Steps:
-    """Draw `count` short arcs along random drives."""
+    """Draw `count` short arcs along random drives, as long as a robot's are.
+
+    A turn tells more of how far it led than the picture does, where only long steps turn so far.
+    """
     world, now = _stand(drives, np.zeros((count, 1), np.int64), rng)
-    length = rng.uniform(0.0, LONGEST_STEP_M, count)
+    speed = np.where(rng.random(count) < AT_FULL_SPEED, 1.0, rng.random(count))
+    length = speed * rng.choice(GAPS, count) * LONGEST_STEP_M / max(GAPS)
     turned = length * rng.uniform(-CURVATURE_PER_M, CURVATURE_PER_M, count)
     half = turned / 2.0  # so short an arc is its chord
     back = np.stack([-length * np.cos(half), length * np.sin(half), -turned], axis=1)
