@@ -73,16 +73,16 @@ class Behavior:
             ModelError: an output is not finite; the state is then as before.
         """
         sight = Sight.of(self._networks, image, self.sight)
-        if sight.begins and self.pinned:
-            self._unlike_start = float(unlikeness(sight.attractor, self._start, 0))
-        elif self._unlike_start > 0.0 and self._is_nearer(sight):
+        if self._is_nearer(sight) and not sight.begins:
             sight = Sight.of(self._networks, image, None)
         return self.follow(sight)
 
     def _is_nearer(self, sight: Sight) -> bool:
         """Whether the robot still comes nearer to where the behavior begins; once no, always no."""
+        if not self.pinned or not (sight.begins or self._unlike_start > 0.0):
+            return False
         unlike = float(unlikeness(sight.attractor, self._start, 0))
-        nearer = unlike < self._unlike_start - NEARER
+        nearer = sight.begins or unlike < self._unlike_start - NEARER
         self._unlike_start = unlike if nearer else 0.0
         return nearer
 

@@ -20,6 +20,7 @@ from cbe_training.drives import Drives
 from cbe_training.networks import BehaviorNetworks
 from cbe_training.policy import Policy, Seen, memorise
 
+USUAL_GAP, OTHER_GAPS = 2, (1, 3)  # steps between frames: the runtime's, and slower and faster
 FRAMES_PAST_GOAL = 3
 FRAMES_OFF_ROUTE = 4
 FRAMES_KIDNAPPED = 14  # and so long where it was carried away, to learn what lost looks like

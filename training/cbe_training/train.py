@@ -25,10 +25,9 @@ from cbe_training.curve import STEPS, Curve
 from cbe_training.drives import Drives, furnished, unseen
 from cbe_training.footage import Footage, retell
 from cbe_training.networks import BehaviorNetworks
-from cbe_training.rollout import Behaviors, Rollouts, roll_out, show
+from cbe_training.rollout import OTHER_GAPS, USUAL_GAP, Behaviors, Rollouts, roll_out, show
 from cbe_training.team import Team
 
-USUAL_GAP, OTHER_GAPS = 2, (1, 3)  # steps between frames: the runtime's, and slower and faster
 VALIDATION_WORLDS, VALIDATION_DRIVES = 10, 20
 VALIDATION_BEHAVIORS = 48
 SAVE_EVERY_S = 240.0

@@ -13,7 +13,7 @@ from cbe import geometry
 from cbe.robot import Robot
 from cbe_training import appearance
 from cbe_training.drives import Drives
-from cbe_training.rollout import ALIASED, photograph
+from cbe_training.rollout import ALIASED, OTHER_GAPS, USUAL_GAP, photograph
 
 GROUP = 6
 AHEAD_STEPS = 40  # views lie up to 2 m further along the drive
@@ -21,7 +21,7 @@ NOT_AHEAD = 0.4  # share of views at the group's first pose
 JITTER_M, JITTER_RAD = 0.3, 0.4
 MOST_JITTER = 1.6
 LONGEST_STEP_M = 0.15  # three steps at full speed
-GAPS = (1, 2, 2, 2, 2, 3)  # steps between two frames, as often as rollouts have them
+GAPS = sorted((*OTHER_GAPS, *[USUAL_GAP] * 4))  # between two frames, as often as in rollouts
 AT_FULL_SPEED = 0.7  # share of the pairs
 CURVATURE_PER_M = 2.3  # the vehicle's tightest
 NOW, TARGET = np.nonzero(~np.eye(GROUP, dtype=np.bool_))  # all ordered pairs of a group
