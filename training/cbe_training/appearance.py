@@ -38,8 +38,9 @@ def sample(rng: np.random.Generator, count: int, height_m: float) -> Appearance:
     offset = rng.normal(0.0, 0.02, (count, 1, 1))
     level = np.arange(256)[None, None, :] / 255.0
     tone = np.clip(gain * tint * level**gamma + offset, 0.0, 1.0) * 255.0
-    narrow = rng.random(count) < 0.1  # narrower cameras leave black borders
+    narrow = rng.random(count) < 0.2  # narrower cameras leave black borders
     border = np.stack([rng.integers(1, 21, count), rng.integers(0, 21, count)], axis=1)
+    border = np.where(rng.random((count, 1)) < 0.5, rng.integers(15, 21, (count, 2)), border)
     return Appearance(
         tone=np.round(tone).astype(np.uint8),
         noise=(rng.random(count) ** 2 * 8.0).astype(np.float32),
