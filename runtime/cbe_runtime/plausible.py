@@ -14,7 +14,9 @@ if TYPE_CHECKING:
     from cbe_runtime.observation import Frame
 
 BLANK_LEVELS = 3
-"""Grey levels that the middle four fifths of a blank picture's pixels span at most."""
+"""Grey levels that a blank picture's pixels span at most, but for the outliers on either side."""
+OUTLIERS = 0.025
+"""Of all pixels: a door at the end of a white corridor, overexposed, takes up little more."""
 BLACK_LEVEL = 8
 """A covered lens: no lit wall is as dark, however near."""
 COVERED_SHARE = 0.4
@@ -126,14 +128,23 @@ class ReturnWatch:
 def is_blank(image: NDArray[np.uint8], *, wall: bool) -> bool:
     """Whether a picture (64, 64, 3) shows nothing; before a `wall` it need not show more."""
     bright = _brightness(image)
-    seen = bright[bright > 0]  # (pixels,)
-    if seen.size < SEEN_SHARE * bright.size:
+    seen = bright > 0
+    if np.count_nonzero(seen) < SEEN_SHARE * bright.size:
         return True
-    # Quantiles, since the rim of what a narrow camera covers is shaded.
-    tenth = seen.size // 10
-    ordered = np.partition(seen, (tenth, seen.size - 1 - tenth))
-    low, high = int(ordered[tenth]), int(ordered[-1 - tenth])
+    ordered = np.sort(bright[_inside(seen)])
+    outliers = int(OUTLIERS * len(ordered))
+    low, high = int(ordered[outliers]), int(ordered[-1 - outliers])
     return high <= BLACK_LEVEL or (high - low <= BLANK_LEVELS and not wall)
+
+
+def _inside(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels (32, 32) without the rim of what a narrow camera covers, which is shaded."""
+    inside = seen.copy()
+    inside[1:] &= seen[:-1]
+    inside[:-1] &= seen[1:]
+    inside[:, 1:] &= seen[:, :-1]
+    inside[:, :-1] &= seen[:, 1:]
+    return inside if inside.any() else seen
 
 
 def _before_a_wall(ranges_m: NDArray[np.float64]) -> bool:

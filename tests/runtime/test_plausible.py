@@ -88,6 +88,14 @@ def test_white_picture_of_a_narrow_camera_is_blank_for_all_its_black_border():
     assert not is_blank(image, wall=False)
 
 
+def test_overexposed_picture_with_a_door_in_it_is_not_blank():
+    image = plain(255)
+    image[20:44, 40:48] = 190  # 5 % of it
+    assert not is_blank(image, wall=False)
+    image[24:44] = 255
+    assert is_blank(image, wall=False)
+
+
 def test_plain_wall_right_ahead_never_stops_the_robot(watched):
     assert {watched.show(plain(200), WALL) for _ in range(100)} == {None}
     assert watched.watch.shows
