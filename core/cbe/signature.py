@@ -1,6 +1,6 @@
 """Names, shapes and types of the ONNX graphs and of their metadata.
 
-Three drive; `shape` is for people and may be missing.
+Three drive; `shape` tells how a route goes on past a joint, and may be missing.
 
 The one place that names them: the exporter writes to it and the runtime refuses what differs.
 Batch 1, one tick, every recurrent state explicit (paper, Sec. III-B to III-D).
@@ -15,6 +15,7 @@ FEATURES = (32, 16, 16)
 ATTRACTOR_SHAPE = (8, 5, 10)  # channels, rows, columns; turning the robot shifts the columns
 ATTRACTOR_SIZE = 400
 EMBEDDING_SIZE = 32
+LOOKAHEAD_M = 0.6  # a waypoint lies so far ahead along the demonstration
 OVERRUN_M = 0.3  # a waypoint runs on so far, straight, past a behavior's end
 SHAPE_POINTS = 8
 

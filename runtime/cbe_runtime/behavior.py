@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 from cbe_runtime.likeness import unlikeness
+from cbe_runtime.onward import Onward
 from cbe_runtime.sight import Sight
 
 if TYPE_CHECKING:
@@ -28,6 +30,7 @@ class Behavior:
 
     def __init__(self, networks: Networks, route: Route, segment: int) -> None:
         self._networks = networks
+        self._route = route
         self._start = route.attractor(segment)
         self._goal = route.attractor(segment + 1)
         self._embedding_goal = route.embedding(segment)
@@ -60,6 +63,25 @@ class Behavior:
             return 0.0
         seen = Sight.of(self._networks, image, None)
         return float(unlikeness(seen.attractor, self._goal))
+
+    def waypoint_m(self, prediction: Prediction) -> tuple[float, float]:
+        """Where to head for, x and y in base_link: what it says, led on past its end by the next.
+
+        Raises:
+            ModelError: an output is not finite.
+        """
+        onward = self._onward
+        x, y = prediction.waypoint_m if onward is None else onward.waypoint_m(prediction)
+        return float(x), float(y)
+
+    @cached_property
+    def _onward(self) -> Onward | None:
+        """Unless nothing follows, or where its end lies or the paths lead is not known."""
+        if self.last or not self.pinned:
+            return None
+        own_m = self._networks.path_m(self._embedding_goal)
+        next_m = self._networks.path_m(self._route.embedding(self.segment + 1))
+        return None if own_m is None or next_m is None else Onward(own_m, next_m)
 
     @property
     def fresh(self) -> bool:

@@ -195,10 +195,12 @@ class Follower:
             return False
         try:
             prediction = self._behavior.tick(image)
+            waypoint_m = self._behavior.waypoint_m(prediction)
         except ModelError:
             self._machine.update(Events(fault=Reason.MODEL_FAULT))
             return False
         self._ticked(frame, prediction)
+        self._waypoint_m = waypoint_m
         self._belief.update(prediction.on_route)
         self._judge_progress(prediction)
         if self._belief.lost and self._machine.state is State.FOLLOWING:

@@ -19,6 +19,7 @@ from cbe_runtime.modelfile import (
     read_metadata,
     state_size,
 )
+from cbe_runtime.pathshape import PathShape
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -76,11 +77,13 @@ class Networks:
         attractor: ort.InferenceSession,
         generator: ort.InferenceSession,
         metadata: Metadata,
+        shape: PathShape | None = None,
     ) -> None:
         self._encoder = encoder = Graph(encoder, "encoder")
         self._attractor = Graph(attractor, "attractor")
         self._generator = generator = Graph(generator, "generator")
         self._metadata = metadata
+        self._shape = shape
         self._first_state = EncoderState(
             encoder.zeros("previous_features"),
             np.ones(1, np.float32),
@@ -94,11 +97,11 @@ class Networks:
     def load(cls, folder: Path = PACKAGED_MODELS) -> Networks:
         """Open `encoder.onnx`, `attractor.onnx` and `generator.onnx` of `folder`.
 
-        All is checked before anything is built.
+        All is checked before anything is built. `shape.onnx` is opened where there is one.
 
         Raises:
             ModelError: a file is missing, too large or no ONNX; names, shapes or types differ
-                from `cbe.signature`; metadata is missing; or the three are of different models.
+                from `cbe.signature`; metadata is missing; or they are of different models.
         """
         files = [
             ModelFile.read(folder / f"{name}.onnx")
@@ -115,8 +118,18 @@ class Networks:
                 f"the encoder, attractor and generator in {folder} are of different models "
                 f"({ids}); export all three from one checkpoint"
             )
+        shape = PathShape.load(folder) if PathShape.there(folder) else None
+        if shape is not None and shape.model_id != parsed[0].model_id:
+            raise ModelError(
+                f"in {folder} shape.onnx is of model {shape.model_id}, the others are of "
+                f"{parsed[0].model_id}; export all from one checkpoint, or delete shape.onnx"
+            )
         return cls(
-            open_session(encoder), open_session(attractor), open_session(generator), parsed[0]
+            open_session(encoder),
+            open_session(attractor),
+            open_session(generator),
+            parsed[0],
+            shape,
         )
 
     @property
@@ -187,6 +200,14 @@ class Networks:
         attractor: NDArray[np.float32]
         (attractor,) = self._attractor.run({"features": features})
         return attractor.reshape(-1)  # (1, 400) to (400,)
+
+    def path_m(self, embedding: NDArray[np.float32]) -> NDArray[np.float64] | None:
+        """Points (8, 2) as `PathShape.read`, or None if the model does not tell.
+
+        Raises:
+            ModelError: an output is not finite.
+        """
+        return None if self._shape is None else self._shape.read(embedding)
 
     def generate(
         self,

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
     from cbe_runtime.route import Route
 
+SHAPE_FILE = f"{signature.shape().name}.onnx"
+
 
 class PathShape:
     """Reads the shape of a behavior's path off its embedding."""
@@ -33,6 +35,11 @@ class PathShape:
     def __init__(self, session: ort.InferenceSession, model_id: str) -> None:
         self._session = session
         self.model_id = model_id
+
+    @staticmethod
+    def there(folder: Path) -> bool:
+        """Whether a model's folder has a `shape.onnx`."""
+        return (folder / SHAPE_FILE).is_file()
 
     @classmethod
     def load(cls, folder: Path) -> PathShape:
@@ -42,8 +49,8 @@ class PathShape:
             ModelError: the folder has none, or it does not match `cbe.signature`.
         """
         graph = signature.shape()
-        path = folder / f"{graph.name}.onnx"
-        if not path.is_file():
+        path = folder / SHAPE_FILE
+        if not cls.there(folder):
             raise ModelError(
                 f"the model in {folder} has no {path.name}, which reads a path off an embedding; "
                 "export it again with this version of cbe-export, or give a folder that has it "

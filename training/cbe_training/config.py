@@ -4,6 +4,8 @@ from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 
+from cbe import signature
+
 
 class Learn(Enum):
     """What a piece of a run learns."""
@@ -82,7 +84,7 @@ class TrainConfig:
     bin_episodes: float = 0.2  # meet bins that the demonstration did not
     without_attractors: float = 0.04  # behaviors learnt from z alone, as the ablation drives them
     without_embedding: float = 0.04  # and from attractors alone
-    lookahead_m: float = 0.6
+    lookahead_m: float = signature.LOOKAHEAD_M
     off_route_m: float = 1.0  # a rollout further off its demonstration ends
     jitter_m: float = 0.3
     jitter_rad: float = 0.2356  # 13.5 deg

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from cbe import geometry, signature
 from cbe_training.config import LossWeights, TrainConfig
 from cbe_training.layout import pose_of
-from cbe_training.networks import LOOKAHEAD_M, STEP_SCALE, BehaviorNetworks, quantise
+from cbe_training.networks import STEP_SCALE, BehaviorNetworks, quantise
 from cbe_training.policy import Seen, look
 from cbe_training.rollout import Behaviors, Rollouts
 from cbe_training.views import GROUP, NOW, TARGET, Steps, Views
@@ -133,7 +133,7 @@ def compute(
     driving = batch.valid & batch.right[:, None] & (batch.on_route > 0.5)
     error = torch.linalg.vector_norm(out.waypoint_m - batch.waypoint_m, dim=-1)
     # Tight turns are rare and forgive least: unweighted, their waypoints came out too straight.
-    turning = 1.0 + TURN_WEIGHT * batch.waypoint_m[..., 1].abs() / LOOKAHEAD_M
+    turning = 1.0 + TURN_WEIGHT * batch.waypoint_m[..., 1].abs() / signature.LOOKAHEAD_M
     related = batch.keep_attractors[batch.memory, 0] > 0.0
     near = _near(batch.goal) & batch.valid & related[:, None]
     pair = torch.ones_like(batch.shown_motion[..., 0], dtype=torch.bool)

@@ -17,7 +17,6 @@ from cbe_training.path import PLACE, PLACE_M, Path, place
 from cbe_training.vision import Attractor, Pair, Relation, Trunk
 
 STEP_SCALE = 5.0
-LOOKAHEAD_M = 0.6
 State = tuple[Tensor, Tensor]  # h, c of an LSTM, each (1, B, size)
 
 
@@ -121,7 +120,7 @@ class Guide(nn.Module):
         start = layout.frame(self.seen(start_relation))
         columns = layout.from_start(embedding_goal), layout.from_end(embedding_goal)
         length_m = layout.length_m(embedding_goal)
-        stride = LOOKAHEAD_M / (length_m + LOOKAHEAD_M)
+        stride = signature.LOOKAHEAD_M / (length_m + signature.LOOKAHEAD_M)
         return torch.stack([start @ columns[0], columns[1]], dim=-3), stride
 
     def forward(
