@@ -37,6 +37,9 @@ class Counting:
     def attract(self, features):
         return np.ones(ATTRACTOR_SIZE, np.float32)
 
+    def path_m(self, embedding):
+        return None
+
     def generate(self, *, state, attractor_start, attractor_goal, **others):
         if state == 0:
             self.given.append((bool(attractor_start.any()), bool(attractor_goal.any())))
