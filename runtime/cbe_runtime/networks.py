@@ -1,4 +1,4 @@
-"""The three ONNX graphs behind one checked, typed interface (paper, Sec. III-B to III-D)."""
+"""The ONNX graphs behind one checked, typed interface (paper, Sec. III-B to III-D)."""
 
 from __future__ import annotations
 
