@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-from cbe_runtime.likeness import unlikeness
+from cbe_runtime.likeness import NEARER, unlikeness
 from cbe_runtime.onward import Onward
 from cbe_runtime.sight import Sight
 
@@ -15,10 +15,6 @@ if TYPE_CHECKING:
 
     from cbe_runtime.networks import Networks, Prediction
     from cbe_runtime.route import Route
-
-
-NEARER = 0.004
-"""By so much is a view less unlike another, a tick later, if the robot comes nearer to it."""
 
 
 class Behavior:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cbe.parking import REACH_M, Parking
+from cbe_runtime.likeness import NEARER
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 class BerthConfig:
     """When the end is held to be still ahead, wherever it was read."""
 
-    nearing: float = 0.004  # unlikeness that a view must be below all before to be nearer
+    nearing: float = NEARER  # unlikeness that a view must be below all before to be nearer
     past: float = 0.012  # above the lowest: the end lies behind
     well_past: float = 0.04  # likewise, even if it was read farther on
     looks: int = 2  # in a row that are not nearer, likewise

@@ -20,6 +20,8 @@ Measured with two models on 68 views of 8 drives in validation worlds: of views 
 15 deg of one another 97 % and more are below it, of 2,080 pairs of other places (more than 2 m or
 60 deg apart, or in another world) fewer than 0.5 %.
 """
+NEARER = 0.004
+"""By so much is a view less unlike another, a tick later, if the robot comes nearer to it."""
 
 
 def unlikeness(
