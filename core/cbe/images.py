@@ -12,6 +12,11 @@ Pixels = NDArray[np.uint8]
 CHANNELS = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1}
 
 
+def load_decoder() -> None:
+    """Load OpenCV now, where the first picture must not wait 30 ms for it."""
+    import cv2  # noqa: F401
+
+
 def decode_image(message: CompressedImage | Image) -> Pixels:
     """The picture as (height, width, 3) uint8 RGB.
 

@@ -1,6 +1,8 @@
 """Any planar lidar's scan brought onto the robot's own rays."""
 
 import math
+from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,23 +43,46 @@ def resample(scan: LaserScan, robot: Robot = Robot()) -> NDArray[np.float32]:
     """
     _check(scan)
     ranges = _clean(scan, robot)
-    increment, step = scan.angle_increment_rad, robot.scan_angle_increment_rad
-    beam_rad = scan.angle_min_rad + increment * np.arange(len(ranges))
+    pairs = _pairs(scan.angle_min_rad, scan.angle_increment_rad, len(ranges), robot)
+    out = ranges.take(pairs.beam)
+    out[pairs.unseen] = np.nan
+    np.fmin.at(out, pairs.ray, ranges.take(pairs.other_beam))  # fmin passes over NaN
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class _Pairs:
+    """Which beams tell of which rays.
+
+    `beam` (rays,) is the one closest to each ray, meaningless at the `unseen` (k,) ones. The
+    others, `other_beam` (n,), tell of the ray closest to each, `ray` (n,).
+    """
+
+    beam: NDArray[np.intp]
+    unseen: NDArray[np.intp]
+    other_beam: NDArray[np.intp]
+    ray: NDArray[np.intp]
+
+
+@lru_cache(maxsize=4)  # a lidar's angles stay the same
+def _pairs(angle_min_rad: float, increment_rad: float, beams: int, robot: Robot) -> _Pairs:
+    step = robot.scan_angle_increment_rad
+    beam_rad = angle_min_rad + increment_rad * np.arange(beams)
     ray_rad = robot.scan_angle_min_rad + step * np.arange(robot.scan_rays)
 
     # The beam closest to each ray; half a beam's width is let in at either end of the scan.
-    turned = np.sign(increment) * (ray_rad - scan.angle_min_rad) + 0.5 * abs(increment)
-    beam = np.floor(turned % TURN / abs(increment))
-    points = beam < len(ranges)
-    out = np.full(robot.scan_rays, np.nan, np.float32)
-    out[points] = ranges[beam[points].astype(np.intp)]
+    turned = np.sign(increment_rad) * (ray_rad - angle_min_rad) + 0.5 * abs(increment_rad)
+    beam = np.floor(turned % TURN / abs(increment_rad))
+    unseen = np.flatnonzero(beam >= beams)
+    beam[unseen] = -1.0  # equals no beam
+    closest = beam.astype(np.intp)
 
     # The ray closest to each beam.
     ahead_rad = (beam_rad + math.pi) % TURN - math.pi
     ray = np.rint((ahead_rad - robot.scan_angle_min_rad) / step).astype(np.intp)
-    inside = (ray >= 0) & (ray < robot.scan_rays)
-    np.fmin.at(out, ray[inside], ranges[inside])  # fmin passes over NaN
-    return out
+    other = np.flatnonzero((ray >= 0) & (ray < robot.scan_rays))
+    other = other[closest[ray[other]] != other]
+    return _Pairs(closest, unseen, other, ray[other])
 
 
 def _check(scan: LaserScan) -> None:

@@ -20,6 +20,8 @@ def limit(motion: Motion, scan_m: NDArray[np.floating], robot: Robot) -> Motion:
     `motion` holds (B,) commands, `scan_m` (B, rays) ranges in metres: inf is no return, NaN is
     invalid. A scan whose rays are all invalid stops the robot; a non-finite command too.
     """
+    if _out_of_reach(motion, scan_m, robot):
+        return motion
     steerable = np.isfinite(motion.steer_rad)
     steer = np.where(steerable, motion.steer_rad, 0.0)
     steer = np.minimum(np.maximum(steer, -robot.max_steer_rad), robot.max_steer_rad)
@@ -35,3 +37,14 @@ def limit(motion: Motion, scan_m: NDArray[np.floating], robot: Robot) -> Motion:
     usable = np.isfinite(motion.speed_mps) & steerable & ~np.isnan(scan_m).all(axis=-1)
     speed = np.minimum(np.where(usable, motion.speed_mps, 0.0), allowed)
     return Motion(np.maximum(speed, 0.0), steer)
+
+
+def _out_of_reach(motion: Motion, scan_m: NDArray[np.floating], robot: Robot) -> bool:
+    """Whether every return is too far away to matter, whatever the arc: true of most steps."""
+    speed, steer = motion.speed_mps, np.abs(motion.steer_rad)
+    fastest = float(speed.max())
+    stopping_m = fastest * REACTION_S + fastest**2 / (2.0 * robot.max_braking_mps2)
+    reach_m = robot.scan_x_m + robot.body_radius_m + MARGIN_M + stopping_m
+    # What is not finite makes a comparison false.
+    possible = float(speed.min()) >= 0.0 and float(steer.max()) <= robot.max_steer_rad
+    return possible and bool(np.fmin.reduce(scan_m, axis=None) > reach_m)

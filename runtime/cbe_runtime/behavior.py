@@ -66,9 +66,18 @@ class Behavior:
         Raises:
             ModelError: an output is not finite.
         """
-        onward = self._onward
+        begins = self.sight is not None and self.sight.begins  # the end is not yet in reach
+        onward = None if begins else self._onward
         x, y = prediction.waypoint_m if onward is None else onward.waypoint_m(prediction)
         return float(x), float(y)
+
+    def look_onward(self) -> None:
+        """Read the next path already, in a step without a tick: it took a tenth of a tick's time.
+
+        Raises:
+            ModelError: an output is not finite.
+        """
+        _ = self._onward
 
     @cached_property
     def _onward(self) -> Onward | None:

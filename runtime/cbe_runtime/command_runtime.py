@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from cbe.codec import prepare
 from cbe.errors import ConfigError
+from cbe.images import load_decoder
 from cbe.link import Link
 from cbe.messages import CameraInfo, CompressedImage, Image, LaserScan, TwistStamped
 from cbe.robot import Robot
@@ -159,6 +160,7 @@ def run(options: argparse.Namespace) -> int:
         patience_s=options.patience,
     )
     received = exit_on_signals(exiting)
+    load_decoder()
     prepare(CompressedImage, Image, CameraInfo, LaserScan, TwistStamped)
     if not config.lockstep:
         scheduling.run_first()  # before the link starts its threads

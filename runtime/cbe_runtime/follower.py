@@ -191,9 +191,10 @@ class Follower:
             return False
         if self._berth.taken:
             return self._park(image, frame)
-        if not self._due(frame):
-            return False
         try:
+            if not self._due(frame):
+                self._behavior.look_onward()
+                return False
             prediction = self._behavior.tick(image)
             waypoint_m = self._behavior.waypoint_m(prediction)
         except ModelError:

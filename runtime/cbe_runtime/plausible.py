@@ -90,10 +90,11 @@ class PictureWatch:
         speed_mps: float,
         now_s: float,
     ) -> Reason | None:
-        if is_blank(image, wall=_before_a_wall(ranges_m)) or self._covered(image):
+        bright = brightness(image)
+        if is_blank(bright, wall=_before_a_wall(ranges_m)) or self._covered(bright):
             return Reason.BLANK_IMAGE
         repeats = self._image is not None and np.array_equal(image, self._image)
-        if not repeats or is_blank(image, wall=False):  # a plain wall looks the same all along
+        if not repeats or is_blank(bright, wall=False):  # a plain wall looks the same all along
             self._doubted_s = None
             return None
         if self._doubted_s is not None:  # the robot stands because of it
@@ -103,9 +104,9 @@ class PictureWatch:
             return None
         return Reason.FROZEN_CAMERA if speed_mps > MOVING_MPS else None
 
-    def _covered(self, image: NDArray[np.uint8]) -> bool:
+    def _covered(self, bright: NDArray[np.uint8]) -> bool:
         """Whether much is black that was lit before, in this picture or an earlier one."""
-        lit = _brightness(image) > BLACK_LEVEL
+        lit = bright > BLACK_LEVEL
         self._lit = lit if self._lit is None else self._lit | lit
         ever = np.count_nonzero(self._lit)
         return bool(ever - np.count_nonzero(lit) > COVERED_SHARE * ever)
@@ -121,17 +122,18 @@ class ReturnWatch:
         """Whether these ranges (rays,) can follow the last ones: walls do not go all at once."""
         if self._many and not np.isfinite(ranges_m).any():
             return False
-        self._many = float((ranges_m < FAR_M).mean()) >= MANY_RAYS
+        near = np.count_nonzero(ranges_m < FAR_M)
+        self._many = bool(near >= MANY_RAYS * len(ranges_m))
         return True
 
 
-def is_blank(image: NDArray[np.uint8], *, wall: bool) -> bool:
-    """Whether a picture (64, 64, 3) shows nothing; before a `wall` it need not show more."""
-    bright = _brightness(image)
+def is_blank(bright: NDArray[np.uint8], *, wall: bool) -> bool:
+    """Whether `brightness` (32, 32) shows nothing; before a `wall` it need not show more."""
     seen = bright > 0
-    if np.count_nonzero(seen) < SEEN_SHARE * bright.size:
+    count = np.count_nonzero(seen)
+    if count < SEEN_SHARE * bright.size:
         return True
-    ordered = np.sort(bright[_inside(seen)])
+    ordered = np.sort(bright, axis=None) if count == bright.size else np.sort(bright[_inside(seen)])
     outliers = int(OUTLIERS * len(ordered))
     low, high = int(ordered[outliers]), int(ordered[-1 - outliers])
     return high <= BLACK_LEVEL or (high - low <= BLANK_LEVELS and not wall)
@@ -153,7 +155,7 @@ def _before_a_wall(ranges_m: NDArray[np.float64]) -> bool:
     return bool(2 * np.count_nonzero(ahead < WALL_M) > len(ahead))
 
 
-def _brightness(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def brightness(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """The brightest colour of every fourth pixel (32, 32) of a picture (64, 64, 3)."""
     some = image[::2, ::2]
     return np.maximum(np.maximum(some[..., 0], some[..., 1]), some[..., 2])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cbe_runtime.observation import Frame
-from cbe_runtime.plausible import RETRY_S, PictureWatch, ReturnWatch, is_blank
+from cbe_runtime.plausible import RETRY_S, PictureWatch, ReturnWatch, brightness, is_blank
 from cbe_runtime.state import Reason
 
 OPEN = np.full(240, 3.0)
@@ -77,23 +77,23 @@ def test_single_blank_picture_is_passed_over(watched):
 
 def test_noise_of_a_covered_lens_is_no_picture():
     noise = np.random.default_rng(0).integers(0, 6, (64, 64, 3), np.uint8)
-    assert is_blank(noise, wall=True)
+    assert is_blank(brightness(noise), wall=True)
 
 
 def test_white_picture_of_a_narrow_camera_is_blank_for_all_its_black_border():
     image = plain(0)
     image[14:50, 10:54] = 255
-    assert is_blank(image, wall=False)
+    assert is_blank(brightness(image), wall=False)
     image[14:50, 10:54] = SCENE[14:50, 10:54]
-    assert not is_blank(image, wall=False)
+    assert not is_blank(brightness(image), wall=False)
 
 
 def test_overexposed_picture_with_a_door_in_it_is_not_blank():
     image = plain(255)
     image[20:44, 40:48] = 190  # 5 % of it
-    assert not is_blank(image, wall=False)
+    assert not is_blank(brightness(image), wall=False)
     image[24:44] = 255
-    assert is_blank(image, wall=False)
+    assert is_blank(brightness(image), wall=False)
 
 
 def test_plain_wall_right_ahead_never_stops_the_robot(watched):
