@@ -200,8 +200,7 @@ class Follower:
         except ModelError:
             self._machine.update(Events(fault=Reason.MODEL_FAULT))
             return False
-        self._ticked(frame, prediction)
-        self._waypoint_m = waypoint_m
+        self._ticked(frame, prediction, waypoint_m)
         self._belief.update(prediction.on_route)
         self._judge_progress(prediction)
         if self._belief.lost and self._machine.state is State.FOLLOWING:
@@ -216,13 +215,15 @@ class Follower:
         new = self._camera_watch.newest(frame) and newer(frame.stamp_ns, self._seen_stamp_ns)
         return due and new and self._picture_watch.shows
 
-    def _ticked(self, frame: Frame, prediction: Prediction | None) -> None:
-        """Keep what a tick on the frame said, if anything."""
+    def _ticked(
+        self,
+        frame: Frame,
+        prediction: Prediction | None,
+        waypoint_m: tuple[float, float] | None,
+    ) -> None:
+        """Keep what a tick on the frame said, if anything, and where it leads."""
         self._saw(frame)
-        self._prediction = prediction
-        self._waypoint_m = None
-        if prediction is not None:
-            self._waypoint_m = (float(prediction.waypoint_m[0]), float(prediction.waypoint_m[1]))
+        self._prediction, self._waypoint_m = prediction, waypoint_m
 
     def _saw(self, frame: Frame) -> None:
         """Note that a network ran on the frame."""
@@ -320,7 +321,11 @@ class Follower:
         except ModelError:
             self._machine.update(Events(fault=Reason.MODEL_FAULT))
             return False
-        self._ticked(frame, search.prediction)
+        waypoint_m = None
+        if search.prediction is not None:
+            x, y = search.prediction.waypoint_m
+            waypoint_m = (float(x), float(y))
+        self._ticked(frame, search.prediction, waypoint_m)
         if search.failed:
             if search.hinted:
                 self._seek(None)
