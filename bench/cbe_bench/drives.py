@@ -13,7 +13,7 @@ from cbe.robot import STEP_S, Robot
 from cbe_bench.rooms import rooms
 from cbe_hil_sim.astar import SPACING_M, GoalField
 from cbe_hil_sim.demonstrator import ENDPOINT_CLEARANCE_M, PATH_CLEARANCE_M, sample_routes
-from cbe_hil_sim.tours import middles, roomy, tour
+from cbe_hil_sim.tours import HAIRPIN_RAD, SHARPEST_RAD, middles, roomy, tour
 from cbe_hil_sim.world import World
 
 LENGTH_SPREAD = 0.15  # a journey's length is drawn from so much below and above that asked for,
@@ -59,7 +59,9 @@ class Pieces:
         try:
             return sample_routes(world, 1, rng, shortest, longest)[0]
         except WorldError:
-            return tour(world, rng, shortest, roomy(world))
+            places = roomy(world)
+            gentle = tour(world, rng, shortest, places)
+            return tour(world, rng, shortest, places, HAIRPIN_RAD) if gentle is None else gentle
 
     def part(
         self, poses: NDArray[np.float64], rng: np.random.Generator
@@ -77,10 +79,11 @@ class Journeys:
     """Whole drives of about a length, from one room to another (paper, Sec. IV-C).
 
     A world too small for a straight way of that length is toured; one without rooms is driven
-    from anywhere to anywhere.
+    from anywhere to anywhere. With `hairpins` tours turn back in passages too, at the car's limit.
     """
 
     length_m: float
+    hairpins: bool = False
 
     def __post_init__(self) -> None:
         """Refuse lengths that are none."""
@@ -103,9 +106,10 @@ class Journeys:
         places = middles(world, within) if within.any() else roomy(world)
         if len(places) == 0:
             return None
+        sharpest_rad = HAIRPIN_RAD if self.hairpins else SHARPEST_RAD
         length_m = self.length_m * (1.0 + rng.uniform(-LENGTH_SPREAD, LENGTH_SPREAD))
         low, high = length_m * (1.0 - END_SPREAD), length_m * (1.0 + END_SPREAD)
-        for way in _ways(world, rng, low, high, places):
+        for way in _ways(world, rng, low, high, places, sharpest_rad):
             numbers = room[world.cells(way)]  # (N,)
             away = (numbers != numbers[0]) & (numbers > 0) if room.max() > 1 else numbers >= 0
             away &= world.clearance_at(way) >= ENDPOINT_CLEARANCE_M
@@ -132,6 +136,7 @@ def _ways(
     low_m: float,
     high_m: float,
     places: NDArray[np.float64],
+    sharpest_rad: float,
 ) -> Iterator[NDArray[np.float64]]:
     """Paths (N, 2) from some of the `places` (K, 2) on: straight ones, then tours."""
     for start in rng.choice(places, _STARTS):
@@ -141,6 +146,6 @@ def _ways(
         for end in rng.choice(far, _ENDS) if len(far) else far:
             yield field.path(end)[::-1]
     for _ in range(_TOURS):
-        way = tour(world, rng, high_m, places)
+        way = tour(world, rng, high_m, places, sharpest_rad)
         if way is not None:
             yield way

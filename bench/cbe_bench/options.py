@@ -105,6 +105,10 @@ def add_journeys(parser: argparse.ArgumentParser, length_m: float = 20.0) -> Non
     parser.add_argument(
         "--obstacles", type=int, default=0, metavar="N", help="put so many bins on the path"
     )
+    parser.add_argument(
+        "--hairpins", action="store_true",
+        help="where a world is too small for a straight way and is toured, turn back in passages",
+    )  # fmt: skip
 
 
 def behaviors(options: argparse.Namespace, steps: int) -> "RunConfig":
@@ -127,7 +131,7 @@ def journeys(options: argparse.Namespace) -> "RunConfig":
     """
     from cbe_bench.drives import Journeys
 
-    return _run(options, Journeys(options.length_m), options.obstacles, 0.0)
+    return _run(options, Journeys(options.length_m, options.hairpins), options.obstacles, 0.0)
 
 
 def _run(

@@ -80,7 +80,7 @@ def scenarios(
     if missing:
         raise WorldError(
             f"no drive of {terms.drives} found for episodes {missing} in {terms.world} "
-            f"(world seeds {tried}); ask for a shorter one or a larger world"
+            f"(world seeds {tried}); ask for a shorter one, a larger world, or --hairpins (route)"
         )
     return [found[index] for index in indices[:count]]
 

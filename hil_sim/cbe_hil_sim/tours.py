@@ -11,11 +11,18 @@ from cbe_hil_sim.world import World
 
 _TRIES = 100
 _LEG_POINTS, _LEG_SHARE, _LEG_TRIES = 20, 0.7, 8
-_SHARPEST_RAD = math.radians(150.0)  # turn from leg to leg; what the car cannot drive, fails
+SHARPEST_RAD = math.radians(90.0)
+"""From leg to leg: a driver whose car cannot reverse looks for room before turning back."""
+HAIRPIN_RAD = math.radians(150.0)
+"""The car's limit, at full lock for half a turn: some such drives fail, and those are left out."""
 
 
 def tour(
-    world: World, rng: np.random.Generator, length_m: float, places: NDArray[np.float64]
+    world: World,
+    rng: np.random.Generator,
+    length_m: float,
+    places: NDArray[np.float64],
+    sharpest_rad: float = SHARPEST_RAD,
 ) -> NDArray[np.float64] | None:
     """A path (N, 2) towards one of the `places` (K, 2) after another, or None."""
     if len(places) == 0:
@@ -26,7 +33,7 @@ def tour(
         field = GoalField(world, rng.choice(places))
         reachable = np.isfinite(field.cost_at(here[None])[0])
         leg = field.path(here) if reachable else here[None]
-        if len(leg) >= _LEG_POINTS and (not legs or _turn(legs[-1], leg) <= _SHARPEST_RAD):
+        if len(leg) >= _LEG_POINTS and (not legs or _turn(legs[-1], leg) <= sharpest_rad):
             legs.append(leg[: max(_LEG_POINTS, round(_LEG_SHARE * len(leg)))])
             refused = 0
             if sum(map(len, legs)) * SPACING_M >= length_m:

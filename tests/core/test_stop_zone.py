@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from cbe import stop_zone
 from cbe.controller import Motion
 from cbe.robot import STEP_S, Robot
 from cbe.stop_zone import limit
@@ -85,3 +86,23 @@ def test_robots_of_a_batch_do_not_affect_each_other():
     motion = limit(Motion(np.full(2, 0.5), np.zeros(2)), scans, ROBOT)
     assert motion.speed_mps[0] == 0.5
     assert motion.speed_mps[1] < 0.3
+
+
+def test_scan_out_of_reach_is_passed_over_only_where_it_allows_everything(monkeypatch):
+    rng = np.random.default_rng(0)
+    cases = []
+    for _ in range(2000):
+        scan = rng.uniform(rng.choice([0.05, 0.3, 0.39]), rng.choice([0.5, 1.0, 8.0]), (2, 240))
+        scan[rng.random(scan.shape) < rng.choice([0.0, 0.01, 1.0], p=[0.6, 0.39, 0.01])] = (
+            rng.choice([np.nan, np.inf, 0.0, -1.0])
+        )
+        speed = rng.uniform(0.0, 0.6, 2) * rng.choice([1.0, 1.0, 1.0, -1.0, np.nan])
+        cases.append((Motion(speed, rng.uniform(-0.38, 0.38, 2)), scan))
+    passed_over = sum(stop_zone._out_of_reach(*case, ROBOT) for case in cases)
+    assert 200 < passed_over < 1500
+    shortcut = [limit(*case, ROBOT) for case in cases]
+    monkeypatch.setattr(stop_zone, "_out_of_reach", lambda *_: False)
+    for short, case in zip(shortcut, cases, strict=True):
+        whole = limit(*case, ROBOT)
+        np.testing.assert_array_equal(short.speed_mps, whole.speed_mps)
+        np.testing.assert_array_equal(short.steer_rad, whole.steer_rad)

@@ -65,6 +65,18 @@ def test_only_a_joint_is_led_past(model_writer, shape_writer, route, tmp_path):
     assert last.waypoint_m(prediction) == tuple(prediction.waypoint_m)
 
 
+def test_next_path_is_read_in_a_step_without_a_tick(
+    model_writer, shape_writer, route, tmp_path, monkeypatch
+):
+    model_writer(tmp_path)
+    shape_writer(tmp_path, LEFT)
+    behavior = Behavior(Networks.load(tmp_path), route, 0)
+    ahead_m = Behavior(Networks.load(tmp_path), route, 0).waypoint_m(before_the_end(0.1))
+    behavior.look_onward()
+    monkeypatch.setattr(Networks, "path_m", None)
+    assert behavior.waypoint_m(before_the_end(0.1)) == ahead_m
+
+
 def test_model_without_shape_drives_on_straight(networks, route):
     prediction = before_the_end(0.1)
     assert Behavior(networks, route, 0).waypoint_m(prediction) == tuple(prediction.waypoint_m)

@@ -14,7 +14,7 @@ from cbe_hil_sim.clearance import Clearance
 from cbe_hil_sim.demonstrator import demonstrate, sample_routes
 from cbe_hil_sim.floorplan import from_floorplan
 from cbe_hil_sim.generate import VALIDATION_SEEDS, generate
-from cbe_hil_sim.tours import roomy, tour
+from cbe_hil_sim.tours import HAIRPIN_RAD, roomy, tour
 from cbe_hil_sim.world import BIN_SIZE_M, World
 from cbe_hil_sim.worldbatch import WorldBatch
 
@@ -133,7 +133,8 @@ def _drive(
             routes = sample_routes(world, per_world - toured, rng, SHORTEST_M, LONGEST_M)
             places = roomy(world)
             ways = [
-                tour(world, rng, rng.uniform(SHORTEST_M, LONGEST_M), places) for _ in range(toured)
+                tour(world, rng, rng.uniform(SHORTEST_M, LONGEST_M), places, HAIRPIN_RAD)
+                for _ in range(toured)
             ]
             routes += [way for way in ways if way is not None]
             paths += routes
