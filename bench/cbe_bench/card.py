@@ -46,6 +46,7 @@ LINES = (
     Line("single-bullet", "single --steps 128 --backend bullet", 200),
     Line("single-narrow", "single --steps 128 --camera 70x55", 200),
     Line("route-20", "route --length-m 20 --precision u4", 500),
+    Line("route-20-hairpins", "route --length-m 20 --precision u4 --hairpins", 500),
     Line("route-20-f32", "route --length-m 20 --precision f32", 500),
     Line("route-20-blind-joints", "route --length-m 20 --precision u4 --no-relocation", 200),
     Line("route-100", "route --length-m 100 --precision u4", 100),

@@ -21,7 +21,7 @@ GROUP = 10
 BIN_MARGIN_SAMPLES = 10
 BIN_PASSAGE_M = 0.6
 BIN_APART_M = 1.5  # from bin to bin, so that the car gets past one side and then the other
-_ROUNDS, _WORLDS, _TRIES = 6, 4, 100
+_ROUNDS, _DRAWS, _WORLDS, _TRIES = 6, 3, 4, 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +65,11 @@ def scenarios(
         WorldError: no world tried yields a drive of that length with a start beside it.
     """
     choice = np.random.default_rng([terms.seed, group])
-    tried = [seeds[int(i)] for i in choice.choice(len(seeds), min(_WORLDS, len(seeds)), False)]
+    tried = [
+        seeds[int(i)]
+        for _ in range(_DRAWS)
+        for i in choice.choice(len(seeds), min(_WORLDS, len(seeds)), False)
+    ]
     indices = [group * GROUP + member for member in range(GROUP)]
     streams = {index: np.random.default_rng([terms.seed, group, index]) for index in indices}
     found: dict[int, tuple[Place, Scenario]] = {}

@@ -49,17 +49,6 @@ class Behavior:
             return 0.0
         return float(unlikeness(self.sight.attractor, self._goal))
 
-    def unlike_goal_in(self, image: NDArray[np.uint8]) -> float:
-        """`unlike_goal` of this one frame (64, 64, 3); no state is touched.
-
-        Raises:
-            ModelError: an output is not finite.
-        """
-        if not self.pinned:
-            return 0.0
-        seen = Sight.of(self._networks, image, None)
-        return float(unlikeness(seen.attractor, self._goal))
-
     def waypoint_m(self, prediction: Prediction) -> tuple[float, float]:
         """Where to head for, x and y in base_link: what it says, led on past its end by the next.
 

@@ -268,19 +268,19 @@ class Follower:
         return np.array([x - OVERRUN_M, y, 0.0])
 
     def _park(self, image: NDArray[np.uint8], frame: Frame) -> bool:
-        """Look whether the end is still ahead, and arrive there; tells whether a network ran."""
+        """Look whether the end is still ahead, and arrive there; tells whether the networks ran."""
         if float(self._motion.speed_mps[0]) <= 0.0:
             self._stand()
             return False
         if not self._due(frame):
             return False
         try:
-            self._berth.look(self._behavior.unlike_goal_in(image))
+            prediction = self._behavior.tick(image)
         except ModelError:
             self._machine.update(Events(fault=Reason.MODEL_FAULT))
             return False
-        self._saw(frame)
-        self._waypoint_m = self._berth.place_m
+        self._berth.look(self._behavior.unlike_goal)
+        self._ticked(frame, prediction, self._berth.place_m)
         return True
 
     def _stand(self) -> None:
@@ -289,7 +289,9 @@ class Follower:
         self._done_ticks = 0
         if self._berth.held_up:
             return  # by an obstacle: it goes on
-        if self._berth.lowest <= self._config.lost.unlike_rest:
+        lost, said = self._config.lost, self._prediction
+        sure = said is not None and said.on_route >= lost.on_route_rest
+        if sure and self._berth.lowest <= lost.unlike_rest:
             self._machine.update(Events(arrived=True))
         else:
             self._lose()

@@ -25,6 +25,7 @@ class LostConfig:
     stop: float = 0.97  # a probability of being lost above this is LOST
     unlike_end: float = 0.33  # where the view is more unlike its attractor, no route ends
     unlike_rest: float = ALIKE  # nor where no view was less unlike, once the robot stands
+    on_route_rest: float = 0.98  # nor where the robot, standing, is less surely on the route
 
 
 class LostBelief:

@@ -205,8 +205,16 @@ def test_end_seen_to_one_side_is_turned_to_though_the_waypoint_is_straight_ahead
 
 def test_robot_that_stands_where_nothing_looks_like_the_end_is_lost(drive, monkeypatch):
     _parks(drive)
-    monkeypatch.setattr(Behavior, "unlike_goal_in", lambda self, image: 0.32)
+    monkeypatch.setattr(Behavior, "unlike_goal", 0.32)
     drive.follower._berth.lowest = 0.32
+    states = [drive.step().state for _ in range(20)]
+    assert State.LOST in states
+    assert State.ARRIVED not in states
+
+
+def test_robot_that_stands_hardly_sure_to_be_on_the_route_is_lost(drive, monkeypatch):
+    _saying(drive, monkeypatch, progress=1.0, on_route=0.9)
+    _parks(drive)
     states = [drive.step().state for _ in range(20)]
     assert State.LOST in states
     assert State.ARRIVED not in states
