@@ -21,7 +21,7 @@ GROUP = 10
 BIN_MARGIN_SAMPLES = 10
 BIN_PASSAGE_M = 0.6
 BIN_APART_M = 1.5  # from bin to bin, so that the car gets past one side and then the other
-_ROUNDS, _DRAWS, _WORLDS, _TRIES = 6, 3, 4, 100
+_ROUNDS, _DRAWS, _WORLDS, _TRIES = 6, 8, 4, 100
 
 
 @dataclass(frozen=True, slots=True)
