@@ -47,4 +47,5 @@ def _out_of_reach(motion: Motion, scan_m: NDArray[np.floating], robot: Robot) ->
     reach_m = robot.scan_x_m + robot.body_radius_m + MARGIN_M + stopping_m
     # What is not finite makes a comparison false.
     possible = float(speed.min()) >= 0.0 and float(steer.max()) <= robot.max_steer_rad
-    return possible and bool(np.fmin.reduce(scan_m, axis=None) > reach_m)
+    nearest_m = np.fmin.reduce(scan_m, axis=-1)  # (B,), NaN where a scan says nothing
+    return possible and bool((nearest_m > reach_m).all())

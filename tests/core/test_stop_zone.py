@@ -106,3 +106,9 @@ def test_scan_out_of_reach_is_passed_over_only_where_it_allows_everything(monkey
         whole = limit(*case, ROBOT)
         np.testing.assert_array_equal(short.speed_mps, whole.speed_mps)
         np.testing.assert_array_equal(short.steer_rad, whole.steer_rad)
+
+
+def test_robot_whose_scan_says_nothing_stops_beside_one_with_a_free_way():
+    scans = np.concatenate([np.full((1, ROBOT.scan_rays), np.nan), scan_of([])])
+    motion = limit(Motion(np.full(2, 0.5), np.zeros(2)), scans, ROBOT)
+    assert motion.speed_mps.tolist() == [0.0, 0.5]
