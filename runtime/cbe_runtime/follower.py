@@ -222,13 +222,9 @@ class Follower:
         waypoint_m: tuple[float, float] | None,
     ) -> None:
         """Keep what a tick on the frame said, if anything, and where it leads."""
-        self._saw(frame)
-        self._prediction, self._waypoint_m = prediction, waypoint_m
-
-    def _saw(self, frame: Frame) -> None:
-        """Note that a network ran on the frame."""
         self._gap_steps, self._since_tick_steps = self._since_tick_steps, 0
         self._seen_stamp_ns = frame.stamp_ns
+        self._prediction, self._waypoint_m = prediction, waypoint_m
 
     def _judge_progress(self, prediction: Prediction) -> None:
         """Start the next behavior, or arrive, once enough ticks in a row say so."""
