@@ -244,7 +244,7 @@ class Follower:
         if not last:
             self._begin(behavior.segment + 1)
         elif as_remembered:
-            self._berth.take(rest, behavior.unlike_goal)
+            self._berth.take(rest, behavior.unlike_goal, prediction.on_route)
             self._waypoint_m = self._berth.place_m
 
     def _free_ahead_m(self) -> float:
@@ -275,7 +275,8 @@ class Follower:
         except ModelError:
             self._machine.update(Events(fault=Reason.MODEL_FAULT))
             return False
-        self._berth.look(self._behavior.unlike_goal)
+        end = self._end(prediction) if self._behavior.pinned else self._berth.pose
+        self._berth.look(end, self._behavior.unlike_goal, prediction.on_route)
         self._ticked(frame, prediction, self._berth.place_m)
         return True
 
@@ -285,9 +286,8 @@ class Follower:
         self._done_ticks = 0
         if self._berth.held_up:
             return  # by an obstacle: it goes on
-        lost, said = self._config.lost, self._prediction
-        sure = said is not None and said.on_route >= lost.on_route_rest
-        if sure and self._berth.lowest <= lost.unlike_rest:
+        lost, berth = self._config.lost, self._berth
+        if berth.most_doubt <= lost.doubt_rest and berth.lowest <= lost.unlike_rest:
             self._machine.update(Events(arrived=True))
         else:
             self._lose()

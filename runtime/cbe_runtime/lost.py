@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from cbe_runtime.likeness import ALIKE
-
 SUREST_LOG_ODDS = 5.0
 """Of a belief: however long all went well, a second or two must be able to turn it."""
 
@@ -24,8 +22,8 @@ class LostConfig:
     per_tick: float = 0.001  # probability of getting lost in any one tick
     stop: float = 0.97  # a probability of being lost above this is LOST
     unlike_end: float = 0.33  # where the view is more unlike its attractor, no route ends
-    unlike_rest: float = ALIKE  # nor where no view was less unlike, once the robot stands
-    on_route_rest: float = 0.98  # nor where the robot, standing, is less surely on the route
+    unlike_rest: float = 0.25  # nor where no view was less unlike while the robot parked
+    doubt_rest: float = 0.02  # nor where it then was so probably off the route
 
 
 class LostBelief:

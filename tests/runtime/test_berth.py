@@ -9,10 +9,13 @@ from cbe.robot import STEP_S, Robot
 from cbe_runtime.berth import Berth, BerthConfig
 
 
-def driven_m(read_m, unlike):
-    """How far it drives from where the end was read `read_m` ahead; `unlike` is of the distance."""
+def driven_m(read_m, unlike, end_m=None):
+    """How far it drives; `unlike` is of the distance.
+
+    The end is first read `read_m` ahead, later views read it at `end_m`, or agree where that is None.
+    """
     berth = Berth(Robot(), BerthConfig())
-    berth.take(np.array([read_m, 0.0, 0.0]), unlike(0.0))
+    berth.take(pose(read_m), unlike(0.0), 1.0)
     motion, x_m = Motion(np.array([0.5]), np.zeros(1)), 0.0
     for step in range(100):
         motion = berth.step(motion)
@@ -22,8 +25,14 @@ def driven_m(read_m, unlike):
         x_m += travel_m
         berth.carry((berth.pose[0] - travel_m, 0.0), travel_m, 0.0)
         if step % 2 == 1:
-            berth.look(unlike(x_m))
+            read = berth.pose if end_m is None else pose(end_m - x_m)
+            berth.look(read, unlike(x_m), 1.0)
     pytest.fail("never stood")
+
+
+def pose(x_m):
+    """Straight ahead."""
+    return np.array([x_m, 0.0, 0.0])
 
 
 def test_stands_where_the_end_was_read_if_the_view_agrees():
@@ -49,11 +58,25 @@ def test_view_that_gets_more_alike_for_ever_does_not_lead_astray():
     assert driven_m(0.2, lambda x_m: 1.0 - 0.3 * x_m) < REACH_M + 0.2
 
 
+def test_later_views_correct_the_first():
+    assert driven_m(0.7, lambda x_m: 0.2, end_m=0.4) == pytest.approx(0.4, abs=0.1)
+
+
+def test_headings_are_corrected_the_short_way_round():
+    berth = Berth(Robot(), BerthConfig())
+    berth.take(np.array([0.5, 0.0, 3.1]), 0.2, 1.0)
+    berth.look(np.array([0.5, 0.0, -3.1]), 0.2, 1.0)
+    assert abs(berth.pose[2]) > 3.1
+
+
 def test_parking_again_begins_anew():
     berth = Berth(Robot(), BerthConfig())
+    moving = Motion(np.array([0.5]), np.zeros(1))
     for _ in range(2):
-        berth.take(np.array([0.02, 0.0, 0.0]), 0.3)
-        berth.carry((-0.03, 0.0), 0.05, 0.0)
-        berth.look(0.2)
-        assert berth.place_m == (BerthConfig().ahead_m, 0.0)
+        berth.take(pose(0.02), 0.3, 1.0)
+        berth.look(pose(-0.03), 0.2, 0.4)
+        assert berth.step(moving).speed_mps > 0.0  # it creeps on
+        assert berth.lowest == 0.2
+        assert berth.most_doubt == pytest.approx(0.6)
         berth.carry((0.0, 0.0), REACH_M, 0.0)
+        assert berth.step(moving).speed_mps == 0.0

@@ -8,6 +8,7 @@ from cbe.errors import ModelError, RouteError
 from cbe.robot import STEP_S, Robot
 from cbe.signature import OVERRUN_M
 from cbe_runtime.behavior import Behavior
+from cbe_runtime.berth import BerthConfig
 from cbe_runtime.follower import Follower
 from cbe_runtime.followerconfig import FollowerConfig
 from cbe_runtime.networks import Networks
@@ -176,7 +177,9 @@ def _parks(drive):
     pytest.fail("never arrived")
 
 
-def test_arrives_once_it_stands_where_it_sees_the_end(drive):
+def test_arrives_once_it_stands_where_it_sees_the_end(networks, route):
+    steadfast = FollowerConfig(berth=BerthConfig(trust=0.0))  # the end that it sees moves with it
+    drive = Drive(Follower(networks, route, config=steadfast))
     decision = _parks(drive)
     assert decision.segment == 1
     speeds = [decision.speed_mps]
@@ -207,7 +210,7 @@ def test_robot_that_stands_where_nothing_looks_like_the_end_is_lost(drive, monke
     _parks(drive)
     monkeypatch.setattr(Behavior, "unlike_goal", 0.32)
     drive.follower._berth.lowest = 0.32
-    states = [drive.step().state for _ in range(20)]
+    states = [drive.step().state for _ in range(40)]
     assert State.LOST in states
     assert State.ARRIVED not in states
 
@@ -215,7 +218,16 @@ def test_robot_that_stands_where_nothing_looks_like_the_end_is_lost(drive, monke
 def test_robot_that_stands_hardly_sure_to_be_on_the_route_is_lost(drive, monkeypatch):
     _saying(drive, monkeypatch, progress=1.0, on_route=0.9)
     _parks(drive)
-    states = [drive.step().state for _ in range(20)]
+    states = [drive.step().state for _ in range(40)]
+    assert State.LOST in states
+    assert State.ARRIVED not in states
+
+
+def test_one_view_unsure_of_the_route_while_parking_is_enough_to_be_lost(drive, monkeypatch):
+    with monkeypatch.context() as patch:
+        _saying(drive, patch, progress=1.0, on_route=0.9)
+        _parks(drive)
+    states = [drive.step().state for _ in range(40)]
     assert State.LOST in states
     assert State.ARRIVED not in states
 
