@@ -12,7 +12,7 @@ from cbe_runtime.berth import Berth, BerthConfig
 def driven_m(read_m, unlike, end_m=None):
     """How far it drives; `unlike` is of the distance.
 
-    The end is first read `read_m` ahead, later views read it at `end_m`, or agree where that is None.
+    The end is first read `read_m` ahead, then at `end_m`, or where it was if that is None.
     """
     berth = Berth(Robot(), BerthConfig())
     berth.take(pose(read_m), unlike(0.0), 1.0)
