@@ -86,7 +86,7 @@ class Berth:
 
     def step(self, motion: Motion) -> Motion:
         """Next commanded motion (1,), from the present one."""
-        x, y, yaw = self.pose
+        pose = self.pose.copy()
         if self._nearer and self._driven_m < REACH_M:
-            x = max(x, self._config.ahead_m)
-        return self._parking.step(motion, np.array([x, y, yaw]))
+            pose[0] = max(pose[0], self._config.ahead_m)
+        return self._parking.step(motion, pose)
