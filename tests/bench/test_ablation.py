@@ -49,7 +49,8 @@ class NeedsItsMemory:
         assert np.all(embedding_goal == LAST) or not embedding_goal.any()
         assert all(np.all(each != 0.0) for each in (now["attractor_now"], now["embedding_now"]))
         lost = self.stubborn or not (attractor_start.any() and attractor_goal.any())
-        progress, end = 0.0 if lost else state / 3.0, np.array([0.2, 0.0, 1.0, 0.0])
+        progress = 0.0 if lost else state / 3.0
+        end = np.array([0.3 * (1.0 - progress), 0.0, 1.0, 0.0])
         return Prediction(np.array([0.5, 0.0]), progress, 1.0, end), state + 1
 
 

@@ -83,8 +83,9 @@ class StraightOn:
         return np.full(400, 0.5, np.float32)
 
     def generate(self, *, state, **memory):
-        end = np.array([0.2, 0.0, 1.0, 0.0])
-        return Prediction(np.array([0.5, 0.0]), self._progress(state), 1.0, end), state + 1
+        progress = self._progress(state)
+        end = np.array([(1.0 - progress) * LENGTH_M, 0.0, 1.0, 0.0])
+        return Prediction(np.array([0.5, 0.0]), progress, 1.0, end), state + 1
 
 
 class Blind:
