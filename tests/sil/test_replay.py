@@ -54,7 +54,9 @@ def test_decisions_of_a_killed_black_box_come_out_the_same(
     assert code == 0
     lines = [json.loads(line) for line in replay.output.splitlines() if line.startswith("{")]
     assert len(lines) > STEPS
-    assert all(line["same"] for line in lines)
+    same = [line["same"] for line in lines]  # None before the replay takes the drive up
+    assert any(same)
+    assert False not in same
     assert sheet.read_bytes().startswith(b"\x89PNG")
 
 
