@@ -177,6 +177,12 @@ def _parks(drive):
     pytest.fail("never arrived")
 
 
+def _is_lost_and_never_arrives(drive):
+    states = [drive.step().state for _ in range(40)]
+    assert State.LOST in states
+    assert State.ARRIVED not in states
+
+
 def test_arrives_once_it_stands_where_it_sees_the_end(networks, route):
     steadfast = FollowerConfig(berth=BerthConfig(trust=0.0))  # the end that it sees moves with it
     drive = Drive(Follower(networks, route, config=steadfast))
@@ -210,26 +216,20 @@ def test_robot_that_stands_where_nothing_looks_like_the_end_is_lost(drive, monke
     _parks(drive)
     monkeypatch.setattr(Behavior, "unlike_goal", 0.32)
     drive.follower._berth.lowest = 0.32
-    states = [drive.step().state for _ in range(40)]
-    assert State.LOST in states
-    assert State.ARRIVED not in states
+    _is_lost_and_never_arrives(drive)
 
 
 def test_robot_that_stands_hardly_sure_to_be_on_the_route_is_lost(drive, monkeypatch):
     _saying(drive, monkeypatch, progress=1.0, on_route=0.9)
     _parks(drive)
-    states = [drive.step().state for _ in range(40)]
-    assert State.LOST in states
-    assert State.ARRIVED not in states
+    _is_lost_and_never_arrives(drive)
 
 
 def test_one_view_unsure_of_the_route_while_parking_is_enough_to_be_lost(drive, monkeypatch):
     with monkeypatch.context() as patch:
         _saying(drive, patch, progress=1.0, on_route=0.9)
         _parks(drive)
-    states = [drive.step().state for _ in range(40)]
-    assert State.LOST in states
-    assert State.ARRIVED not in states
+    _is_lost_and_never_arrives(drive)
 
 
 def test_robot_held_up_on_its_last_metre_goes_on(drive, monkeypatch):
