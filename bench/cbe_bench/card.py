@@ -44,7 +44,7 @@ LINES = (
     ),
     Line("single-u4", "single --steps 128 --precision u4", 2000),
     Line("single-bullet", "single --steps 128 --backend bullet", 200),
-    Line("single-narrow", "single --steps 128 --camera 70x55", 200),
+    Line("single-narrow", "single --steps 128 --camera 70x55", 2000),
     Line("route-20", "route --length-m 20 --precision u4", 500),
     Line("route-20-hairpins", "route --length-m 20 --precision u4 --hairpins", 500),
     Line("route-20-f32", "route --length-m 20 --precision f32", 500),

@@ -21,6 +21,7 @@ from cbe_runtime.caution import slowed
 from cbe_runtime.decision import Asked, Decision
 from cbe_runtime.followerconfig import FollowerConfig
 from cbe_runtime.joining import Search, Whereabouts, advice
+from cbe_runtime.likeness import visible
 from cbe_runtime.lost import LostBelief
 from cbe_runtime.observation import Observation, StampWatch, newer, usable_image, usable_ranges
 from cbe_runtime.plausible import PictureWatch, ReturnWatch
@@ -266,7 +267,7 @@ class Follower:
     def _park(self, image: NDArray[np.uint8], frame: Frame) -> bool:
         """Look whether the end is still ahead, and arrive there; tells whether the networks ran."""
         if float(self._motion.speed_mps[0]) <= 0.0:
-            self._stand()
+            self._stand(image)
             return False
         if not self._due(frame):
             return False
@@ -280,17 +281,29 @@ class Follower:
         self._ticked(frame, prediction, self._berth.place_m)
         return True
 
-    def _stand(self) -> None:
+    def _stand(self, image: NDArray[np.uint8]) -> None:
         """Having come to stand, arrive if this is the end."""
         self._berth.taken = False
         self._done_ticks = 0
         if self._berth.held_up:
             return  # by an obstacle: it goes on
         lost, berth = self._config.lost, self._berth
-        if berth.most_doubt <= lost.doubt_rest and berth.lowest <= lost.unlike_rest:
+        sure = berth.most_doubt <= lost.doubt_rest
+        alike = berth.lowest <= lost.unlike_rest * visible(image) ** lost.narrow
+        if sure and alike and self._apart_m() <= lost.apart_rest_m:
             self._machine.update(Events(arrived=True))
         else:
             self._lose()
+
+    def _apart_m(self) -> float:
+        """How far from where the view shows the end the waypoint, which runs past it, puts it."""
+        if self._prediction is None:
+            return 0.0
+        x, y, yaw = self._end(self._prediction)
+        ahead_x, ahead_y = self._prediction.waypoint_m
+        return math.hypot(
+            ahead_x - OVERRUN_M * math.cos(yaw) - x, ahead_y - OVERRUN_M * math.sin(yaw) - y
+        )
 
     def _lose(self) -> None:
         """Stand, and look for the place."""

@@ -42,3 +42,18 @@ def unlikeness(
         errors.append(np.square(difference).mean(axis=(-3, -2, -1)))
     least: NDArray[np.float32] = np.sqrt(np.min(errors, axis=0))
     return least
+
+
+def visible(image: NDArray[np.uint8]) -> float:
+    """Share (0 to 1) of a view (64, 64, 3) within the borders that a narrower camera leaves black.
+
+    Borders are alike anywhere, so views of a narrower camera are less unlike on the whole.
+    """
+    lit = image.any(axis=-1)
+    return _extent(lit.any(axis=0)) * _extent(lit.any(axis=1)) / lit.size
+
+
+def _extent(lit: NDArray[np.bool_]) -> int:
+    """From the first to the last that is."""
+    where = np.flatnonzero(lit)
+    return int(where[-1] - where[0]) + 1 if where.size else 0

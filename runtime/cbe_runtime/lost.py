@@ -22,8 +22,10 @@ class LostConfig:
     per_tick: float = 0.001  # probability of getting lost in any one tick
     stop: float = 0.97  # a probability of being lost above this is LOST
     unlike_end: float = 0.33  # where the view is more unlike its attractor, no route ends
-    unlike_rest: float = 0.25  # nor where no view was less unlike while the robot parked
+    unlike_rest: float = 0.25  # nor where all views while the robot parked were, and
+    narrow: float = 0.7  # less for a narrower camera: times the share it sees to this power
     doubt_rest: float = 0.02  # nor where it then was so probably off the route
+    apart_rest_m: float = 0.22  # nor where view and waypoint at last put the end so far apart
 
 
 class LostBelief:
