@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cbe.camera import MODEL_CAMERA
-from cbe.signature import ATTRACTOR_SIZE, EMBEDDING_SIZE
+from cbe.signature import ATTRACTOR_SIZE, EMBEDDING_SIZE, OVERRUN_M
 from cbe_bench import evaluation, scenario
 from cbe_bench.ablation import CLONED, PARTS
 from cbe_bench.cli import main
@@ -51,7 +51,7 @@ class NeedsItsMemory:
         lost = self.stubborn or not (attractor_start.any() and attractor_goal.any())
         progress = 0.0 if lost else state / 3.0
         end = np.array([0.3 * (1.0 - progress), 0.0, 1.0, 0.0])
-        return Prediction(np.array([0.5, 0.0]), progress, 1.0, end), state + 1
+        return Prediction(np.array([end[0] + OVERRUN_M, 0.0]), progress, 1.0, end), state + 1
 
 
 @pytest.fixture(autouse=True)

@@ -8,6 +8,7 @@ import pytest
 
 from cbe.camera import MODEL_CAMERA
 from cbe.messages import Twist, TwistStamped
+from cbe.signature import OVERRUN_M
 from cbe.topics import CMD_VEL
 from cbe_bench import evaluation, scenario, single
 from cbe_bench.cli import main
@@ -85,7 +86,8 @@ class StraightOn:
     def generate(self, *, state, **memory):
         progress = self._progress(state)
         end = np.array([(1.0 - progress) * LENGTH_M, 0.0, 1.0, 0.0])
-        return Prediction(np.array([0.5, 0.0]), progress, 1.0, end), state + 1
+        ahead = np.array([min(0.5, end[0] + OVERRUN_M), 0.0])
+        return Prediction(ahead, progress, 1.0, end), state + 1
 
 
 class Blind:

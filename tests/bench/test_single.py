@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from cbe.camera import MODEL_CAMERA
+from cbe.signature import OVERRUN_M
 from cbe_bench import evaluation, scenario
 from cbe_bench.cli import main
 from cbe_runtime.networks import Networks, Prediction
@@ -38,8 +39,8 @@ class StraightOn:
         return np.zeros(400, np.float32)
 
     def generate(self, *, state, **memory):
-        end = np.array([0.2, 0.0, 1.0, 0.0])
-        return Prediction(np.array([0.5, 0.0]), 0.1 * state, 1.0, end), state + 1
+        end, ahead = np.array([0.2, 0.0, 1.0, 0.0]), np.array([0.2 + OVERRUN_M, 0.0])
+        return Prediction(ahead, 0.1 * state, 1.0, end), state + 1
 
 
 @pytest.fixture(autouse=True)

@@ -115,7 +115,13 @@ def test_single_tick_of_high_progress_does_not_switch(drive, monkeypatch):
 
 
 def _saying(drive, monkeypatch, segment=1, **said):
-    """Have the generator say this from now on; the route's last segment is 1."""
+    """Have the generator say this from now on; the route's last segment is 1.
+
+    Where only the end is said, the waypoint lies beyond it.
+    """
+    if "end" in said:
+        x, y, cos, sin = said["end"]
+        said.setdefault("waypoint_m", np.array([x + OVERRUN_M * cos, y + OVERRUN_M * sin]))
     drive.step()
     drive.follower._begin(segment)
     generate = Networks.generate
@@ -138,8 +144,8 @@ def _saying(drive, monkeypatch, segment=1, **said):
 def test_stalled_progress_arrives_only_where_the_waypoint_says_rest(
     drive, monkeypatch, progress, waypoint_x_m, state
 ):
-    waypoint_m, end = np.array([waypoint_x_m, 0.0]), np.array([0.8, 0.0, 1.0, 0.0])
-    _saying(drive, monkeypatch, progress=progress, waypoint_m=waypoint_m, end=end)
+    end = np.array([waypoint_x_m - OVERRUN_M, 0.0, 1.0, 0.0])
+    _saying(drive, monkeypatch, progress=progress, end=end)
     assert drive.step(40).state is state
 
 
@@ -207,7 +213,7 @@ def test_end_seen_to_one_side_is_turned_to_though_the_waypoint_is_straight_ahead
     drive, monkeypatch
 ):
     end = np.array([0.3, 0.1, np.cos(0.4), np.sin(0.4)])
-    _saying(drive, monkeypatch, progress=1.0, end=end)
+    _saying(drive, monkeypatch, progress=1.0, end=end, waypoint_m=np.array([0.6, 0.0]))
     _parks(drive)
     assert drive.step().yaw_rate_rad_s > 0.5
 
@@ -232,6 +238,29 @@ def test_one_view_unsure_of_the_route_while_parking_is_enough_to_be_lost(drive, 
     _is_lost_and_never_arrives(drive)
 
 
+@pytest.mark.parametrize(("apart_m", "state"), [(0.2, State.ARRIVED), (0.25, State.LOST)])
+def test_robot_that_stands_where_two_readings_of_the_end_disagree_is_lost(
+    drive, monkeypatch, apart_m, state
+):
+    end, waypoint_m = np.array([0.0, 0.0, 1.0, 0.0]), np.array([OVERRUN_M, apart_m])
+    _saying(drive, monkeypatch, progress=1.0, end=end, waypoint_m=waypoint_m)
+    _parks(drive)
+    while (decision := drive.step()).state is State.FOLLOWING:
+        pass
+    assert decision.state is state
+
+
+@pytest.mark.parametrize(("share", "state"), [(1.0, State.ARRIVED), (0.5, State.LOST)])
+def test_narrower_camera_must_see_its_end_more_alike(drive, monkeypatch, share, state):
+    _parks(drive)
+    monkeypatch.setattr(Behavior, "unlike_goal", 0.2)
+    monkeypatch.setattr("cbe_runtime.follower.visible", lambda image: share)
+    drive.follower._berth.lowest = 0.2
+    while (decision := drive.step()).state is State.FOLLOWING:
+        pass
+    assert decision.state is state
+
+
 def test_robot_held_up_on_its_last_metre_goes_on(drive, monkeypatch):
     _saying(drive, monkeypatch, progress=1.0, end=np.array([0.5, 0.0, 1.0, 0.0]))
     _parks(drive)
@@ -250,7 +279,8 @@ def test_end_seen_too_far_away_is_no_arrival(drive, monkeypatch):
 
 def test_memory_without_attractors_rests_before_the_last_waypoint(drive, monkeypatch):
     monkeypatch.setattr(Behavior, "pinned", False)
-    _saying(drive, monkeypatch, progress=1.0, end=np.array([2.0, 0.0, 1.0, 0.0]))
+    end, waypoint_m = np.array([2.0, 0.0, 1.0, 0.0]), np.array([0.5, 0.0])
+    _saying(drive, monkeypatch, progress=1.0, end=end, waypoint_m=waypoint_m)
     assert drive.step(20).state is State.ARRIVED
 
 
