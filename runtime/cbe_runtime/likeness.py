@@ -49,11 +49,8 @@ def visible(image: NDArray[np.uint8]) -> float:
 
     Borders are alike anywhere, so views of a narrower camera are less unlike on the whole.
     """
-    lit = image.any(axis=-1)
-    return _extent(lit.any(axis=0)) * _extent(lit.any(axis=1)) / lit.size
-
-
-def _extent(lit: NDArray[np.bool_]) -> int:
-    """From the first to the last that is."""
-    where = np.flatnonzero(lit)
-    return int(where[-1] - where[0]) + 1 if where.size else 0
+    rows, columns = np.nonzero(image.max(axis=-1))
+    if not len(rows):
+        return 0.0
+    seen = (int(np.ptp(rows)) + 1) * (int(np.ptp(columns)) + 1)
+    return seen / (image.shape[0] * image.shape[1])
