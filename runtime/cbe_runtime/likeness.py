@@ -53,4 +53,4 @@ def visible(image: NDArray[np.uint8]) -> float:
     if not len(rows):
         return 0.0
     seen = (int(np.ptp(rows)) + 1) * (int(np.ptp(columns)) + 1)
-    return seen / (image.shape[0] * image.shape[1])
+    return seen / float(image[..., 0].size)
