@@ -292,8 +292,9 @@ class Follower:
         alike = berth.lowest <= lost.unlike_rest * visible(image) ** lost.narrow
         if sure and alike and self._apart_m() <= lost.apart_rest_m:
             self._machine.update(Events(arrived=True))
-        else:
-            self._lose()
+            return
+        assert self._behavior.sight is not None
+        self._lose().give_up(self._behavior.sight)  # to look again it would drive on past the end
 
     def _apart_m(self) -> float:
         """How far from where the view shows the end the waypoint, which runs past it, puts it."""
@@ -305,18 +306,18 @@ class Follower:
             ahead_x - OVERRUN_M * math.cos(yaw) - x, ahead_y - OVERRUN_M * math.sin(yaw) - y
         )
 
-    def _lose(self) -> None:
+    def _lose(self) -> Search:
         """Stand, and look for the place."""
         self._machine.update(Events(lost=True))
-        self._seek(None)
+        return self._seek(None)
 
-    def _seek(self, near: Whereabouts | None) -> None:
+    def _seek(self, near: Whereabouts | None) -> Search:
         """Begin to look for the robot's place."""
-        self._search = Search(
-            self._networks, self._route, self._config.lost, self._config.join, near
-        )
+        search = Search(self._networks, self._route, self._config.lost, self._config.join, near)
+        self._search = search
         self._prediction = None
         self._waypoint_m = None
+        return search
 
     def _look_for_place(self, image: NDArray[np.uint8], frame: Frame) -> bool:
         """A tick of the search if it is due; tells whether the networks ran."""

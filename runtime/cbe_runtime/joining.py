@@ -159,6 +159,10 @@ class Search:
         elif not self.failed:
             self._follow(Sight.of(self._networks, image, self._sight))
 
+    def give_up(self, sight: Sight) -> None:
+        """Not look before the view is another: `sight` did not suffice, and driving on may harm."""
+        self.failed, self._view = True, sight.attractor
+
     def elsewhere(self, image: NDArray[np.uint8]) -> bool:
         """Whether the view is another than that of the search's last frame.
 

@@ -248,6 +248,8 @@ def test_robot_that_stands_where_two_readings_of_the_end_disagree_is_lost(
     while (decision := drive.step()).state is State.FOLLOWING:
         pass
     assert decision.state is state
+    later = drive.step(100)
+    assert (later.state, later.speed_mps) == (state, 0.0)  # nor does it drive on to look again
 
 
 @pytest.mark.parametrize(("share", "state"), [(1.0, State.ARRIVED), (0.5, State.LOST)])
