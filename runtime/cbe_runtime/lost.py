@@ -25,7 +25,7 @@ class LostConfig:
     unlike_rest: float = 0.25  # nor where all views while the robot parked were, and
     narrow: float = 0.7  # less for a narrower camera: times the share it sees to this power
     doubt_rest: float = 0.02  # nor where it then was so probably off the route
-    apart_rest_m: float = 0.22  # nor where view and waypoint at last put the end so far apart
+    apart_rest_m: float = 0.3  # nor where view and waypoint at last put the end so far apart
 
 
 class LostBelief:

@@ -238,7 +238,7 @@ def test_one_view_unsure_of_the_route_while_parking_is_enough_to_be_lost(drive, 
     _is_lost_and_never_arrives(drive)
 
 
-@pytest.mark.parametrize(("apart_m", "state"), [(0.2, State.ARRIVED), (0.25, State.LOST)])
+@pytest.mark.parametrize(("apart_m", "state"), [(0.25, State.ARRIVED), (0.35, State.LOST)])
 def test_robot_that_stands_where_two_readings_of_the_end_disagree_is_lost(
     drive, monkeypatch, apart_m, state
 ):
