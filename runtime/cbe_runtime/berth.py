@@ -24,7 +24,7 @@ class BerthConfig:
     nearing: float = 0.002  # unlikeness that a view must be below all before to be nearer
     well_past: float = 0.04  # above the lowest: the end lies behind, wherever it was read
     ahead_m: float = 0.02  # where a view is nearer, the end is held to be so far ahead at least
-    beyond_m: float = 0.35  # where it was read first, it is not sought
+    beyond_m: float = 0.35  # farther than that past where it was read first, it is not sought
     trust: float = 0.4  # in what a view says, against what was read before
     held_up_m: float = 0.1
 
