@@ -309,6 +309,23 @@ round_column = block(
 )
 
 
+def high_rack(rng: Rng) -> Piece:
+    """A long row of pallet racks, up to thrice as high as a person can reach."""
+    w, d = rng.uniform(2.5, 12.0), rng.uniform(0.8, 1.3)
+    steel, low = pick(rng, "lacquer"), rng.uniform(0.0, 1.4)
+    gap = low + rng.uniform(0.3, 1.0)
+    top = gap + rng.uniform(0.8, 5.0)
+    below, above = pick(rng, "box", "bookshelf"), pick(rng, "box", "bookshelf", "photo")
+    parts = [Part(0.0, 0.0, w, d, gap, top, above, above)]
+    if low > 0.3:
+        parts += [Part(0.0, 0.0, w - 0.2, d - 0.1, 0.0, low, below, below)]
+    bays = max(round(w / rng.uniform(1.8, 3.2)), 1)
+    for bay in range(bays + 1):
+        u = (bay / bays - 0.5) * (w - 0.1)
+        parts += [Part(u, v, 0.1, 0.1, 0.0, top + 0.3, steel, steel) for v in (-d / 2, d / 2)]
+    return Piece(w, d, tuple(parts))
+
+
 @dataclass(frozen=True, slots=True)
 class Set:
     """What a kind of room holds: first `wanted` pieces, then fillers at the walls and free."""
@@ -317,6 +334,7 @@ class Set:
     walls: tuple[Factory, ...]
     free: tuple[Factory, ...]
     density: float = 1.0  # scales the number of fillers
+    windows: float = 0.35  # a metre of outer wall
 
 
 _CLUTTER = (plant, boxes, crate, stool, bin_, floor_lamp)
@@ -348,6 +366,10 @@ SETS: dict[str, Set] = {
     "hall": Set(
         (), (shelving, stack, rack, boxes, wardrobe, screen_wall, copier),
         (shelving, shelving, stack, divider, divider, column, round_column, crate), 0.3,
+    ),
+    "depot": Set(
+        (), (high_rack, high_rack, shelving, stack, boxes),
+        (high_rack, high_rack, high_rack, stack, crate, boxes, column, divider), 0.15, 0.03,
     ),
     "meeting": Set(
         (), (cabinet, low_shelf, plant, television, bench), (dining_table, screen_wall),

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cbe.errors import WorldError
-from cbe_hil_sim.layout import Layout, Opening, Rect, draw_layout, to_cells
+from cbe_hil_sim.layout import DEPOT, HALL, Layout, Opening, Rect, Style, draw_layout, to_cells
 from cbe_hil_sim.patterns import colour
 from cbe_hil_sim.placing import Footprint, Placer
 from cbe_hil_sim.surfacing import Look, SurfaceTable, Tint, draw_looks, pick
@@ -20,6 +20,9 @@ SPLIT_SEEDS = {"train": TRAIN_SEEDS, "validation": VALIDATION_SEEDS, "test": TES
 
 HALL_EVERY = 3
 """Every so many worlds, the last one is of halls."""
+
+DEPOT_SEEDS = {"train": TRAIN_SEEDS[90_000:], "validation": VALIDATION_SEEDS[9_000:]}
+"""Worlds of depots; there are none to test in, for warehouses of others' making do that."""
 
 Rng = np.random.Generator
 Heights = NDArray[np.float32]
@@ -41,7 +44,12 @@ def split_of(seed: int) -> str:
 
 def is_hall(seed: int) -> bool:
     """Whether the world of `seed` is of halls: few, large, high rooms with bare floors."""
-    return seed % HALL_EVERY == HALL_EVERY - 1
+    return seed % HALL_EVERY == HALL_EVERY - 1 and not is_depot(seed)
+
+
+def is_depot(seed: int) -> bool:
+    """Whether the world of `seed` is a depot: one large high room, mostly, with high racks."""
+    return any(seed in seeds for seeds in DEPOT_SEEDS.values())
 
 
 TEST_HOUSES = [seed for seed in TEST_SEEDS if not is_hall(seed)]
@@ -58,12 +66,19 @@ def generate(seed: int) -> World:
     """
     split = split_of(seed)
     rng = np.random.default_rng([seed, 7])
-    hall = is_hall(seed)
-    layout = draw_layout(rng, hall=hall)
-    ceiling_m = rng.uniform(2.5, 9.0) if hall else rng.uniform(2.3, 3.2)
+    style = DEPOT if is_depot(seed) else HALL if is_hall(seed) else None
+    layout = draw_layout(rng, style)
+    ceiling_m = rng.uniform(*_ceiling_m(style))
     builder = Builder(layout, rng, round(float(ceiling_m), 2))
     builder.build()
     return builder.finish(bank(split), f"{layout.style}-{seed}")
+
+
+def _ceiling_m(style: Style | None) -> tuple[float, float]:
+    """Lowest and highest."""
+    if style is None:
+        return 2.3, 3.2
+    return 2.5, 11.0 if style is DEPOT else 9.0
 
 
 @dataclass(slots=True)
@@ -136,19 +151,22 @@ class Builder:
         if rng.random() < 0.4 and min(rect.width, rect.height) > 40:
             rug = self._somewhere(rect, (1.0, 3.2), 4)
             self.floor[rug.slices] = self._fitted(pick(rng, "rug"), rug, look.tint)
-        if self.layout.rooms[index].kind == "hall" and rng.random() < 0.7:
-            self._mark_floor(rect, look.tint)
+        kind = self.layout.rooms[index].kind
+        if kind in {"hall", "depot"} and rng.random() < 0.7:
+            # A lane along which one drives looks as if one stood.
+            zones, lanes = ((1, 10), 0.6) if kind == "hall" else ((4, 16), 0.85)
+            self._mark_floor(rect, look.tint, zones, lanes)
 
-    def _mark_floor(self, rect: Rect, light: Tint) -> None:
-        """Tape outlines onto a hall's floor, of zones and of lanes from wall to wall."""
+    def _mark_floor(self, rect: Rect, light: Tint, zones: tuple[int, int], lanes: float) -> None:
+        """Tape outlines onto a hall's floor, of zones, a share of them lanes from wall to wall."""
         rng, paint = self.rng, pick(self.rng, "plain_ceiling")
         tapes = [
             self.table.add(paint, (3.0, 3.0), light * colour(rng, (0.0, 0.9), (0.1, 0.9)) / 255.0)
             for _ in range(int(rng.integers(1, 4)))
         ]
-        for _ in range(int(rng.integers(1, 10))):
+        for _ in range(int(rng.integers(*zones))):
             zone = self._somewhere(rect, (0.6, 6.0), 2)
-            if rng.random() < 0.6:
+            if rng.random() < lanes:
                 x, y = (rect, zone) if rng.random() < 0.5 else (zone, rect)
                 zone = Rect(x.x0, y.y0, x.x1, y.y1)
             floor, width = self.floor[zone.slices], int(rng.integers(1, 4))
@@ -228,6 +246,8 @@ class Builder:
         """Hang pictures, boards and shelves on free stretches of wall, one cell deep."""
         rng, rect = self.rng, self.layout.rooms[index].rect
         plenty = rng.uniform(0.0, 0.6)  # some rooms stay bare
+        if self.layout.rooms[index].kind == "depot":
+            plenty *= 0.1
         for side, strip in enumerate(_strips(rect)):
             length = rect.height if side < 2 else rect.width
             for _ in range(int(rng.poisson(plenty * length * RESOLUTION_M))):

@@ -131,7 +131,21 @@ HALL = Style(
     "hall", (200.0, 700.0), (50.0, 320.0), 5.0, (1.6, 3.0), 1, 0.5, 0.5, 0.4,
     ("hall", "hall", "storage", "hall"), 0,
 )  # fmt: skip
-"""Warehouses, workshops and large open floors."""
+"""Workshops, storerooms and open floors."""
+DEPOT = Style(
+    "depot",
+    (150.0, 800.0),
+    (150.0, 1600.0),
+    6.0,
+    (2.0, 4.0),
+    1,
+    0.1,
+    0.8,
+    0.4,
+    ("depot",),
+    0,
+)
+"""Warehouses of mostly one room."""
 
 
 def _divide(rng: Rng, rect: Rect, style: Style, levels: int, rooms: list[Room]) -> None:
@@ -258,12 +272,12 @@ def _name_kinds(rng: Rng, rooms: list[Room], style: Style) -> list[Room]:
     return named
 
 
-def draw_layout(rng: Rng, *, hall: bool = False) -> Layout:
-    """Draw a house, an apartment or an office of 100 to 600 m2, or halls up to 700 m2.
+def draw_layout(rng: Rng, style: Style | None = None) -> Layout:
+    """Draw rooms of a style, else a house, an apartment or an office of 100 to 600 m2.
 
     Every room can be reached.
     """
-    style = HALL if hall else STYLES[int(rng.choice(len(STYLES), p=(0.45, 0.2, 0.35)))]
+    style = style or STYLES[int(rng.choice(len(STYLES), p=(0.45, 0.2, 0.35)))]
     area_m2 = rng.uniform(*style.area_m2)
     ratio = rng.uniform(1.0, 1.9)
     sides = to_cells((area_m2 * ratio) ** 0.5), to_cells((area_m2 / ratio) ** 0.5)

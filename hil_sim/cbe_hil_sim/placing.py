@@ -94,7 +94,7 @@ class Placer:
         for side in range(4):
             length_m = (rect.height if side < 2 else rect.width) * RESOLUTION_M
             if self._outside(rect, side):
-                for _ in range(int(rng.poisson(0.35 * length_m))):
+                for _ in range(int(rng.poisson(content.windows * length_m))):
                     self._at_wall(index, furniture.window(rng), side)
         for _ in range(int(rng.poisson(0.05 * perimeter_m))):
             self._at_wall(index, furniture.closed_door(rng), int(rng.integers(4)))

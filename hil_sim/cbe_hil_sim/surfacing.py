@@ -127,7 +127,7 @@ def draw_looks(rng: Rng, kinds: list[str], style: str) -> list[Look]:
                 shared_light if rng.random() < 0.3 else light(rng),
             )
         )
-    if style == "hall":
+    if style in {"hall", "depot"}:
         plain = _white if rng.random() < 0.5 else _bare
         looks = [plain(rng, look) for look in looks]
     return looks

@@ -7,17 +7,25 @@ from cbe.errors import WorldError
 from cbe_hil_sim import textures
 from cbe_hil_sim.floorplan import FloorPlan, from_floorplan, from_image, from_polygons, read_map
 from cbe_hil_sim.generate import (
+    DEPOT_SEEDS,
     TEST_SEEDS,
     TRAIN_SEEDS,
     VALIDATION_SEEDS,
     generate,
+    is_depot,
     is_hall,
     split_of,
 )
-from cbe_hil_sim.layout import draw_layout
+from cbe_hil_sim.layout import DEPOT, HALL, draw_layout
 from cbe_hil_sim.world import BLOCKING_HEIGHT_M, RESOLUTION_M
 
-SEEDS = [*range(20), 100_000, 109_999, 200_000, 209_999]
+SEEDS = [*range(20), 100_000, 108_999, 200_000, 209_999, *DEPOT_SEEDS["train"][:5]]
+
+
+def layout_of(seed, *more):
+    """As `generate` draws it for `more` of 7."""
+    style = DEPOT if is_depot(seed) else HALL if is_hall(seed) else None
+    return draw_layout(np.random.default_rng([seed, *more]), style)
 
 
 @pytest.fixture(scope="module", params=SEEDS)
@@ -36,10 +44,10 @@ def test_outer_walls_close_the_world(world):
     np.testing.assert_allclose(edge, world.ceiling_m)
 
 
-def test_building_is_between_100_and_700_m2(world):
+def test_building_is_between_100_and_800_m2(world):
     width_m, height_m = world.size_m
     assert width_m * height_m >= 100.0
-    assert (world.solid_top_m < world.ceiling_m).sum() * RESOLUTION_M**2 <= 700.0
+    assert (world.solid_top_m < world.ceiling_m).sum() * RESOLUTION_M**2 <= 800.0
 
 
 def test_spans_hang_above_what_stands_and_below_the_ceiling(world):
@@ -80,7 +88,7 @@ def test_different_seeds_give_different_worlds():
 @pytest.mark.parametrize("seed", range(40))
 def test_doors_are_wide_enough_and_free_on_both_sides(seed):
     world = generate(seed)
-    layout = draw_layout(np.random.default_rng([seed, 7]), hall=is_hall(seed))
+    layout = layout_of(seed, 7)
     assert layout.shape == world.solid_top_m.shape
     for opening in layout.openings:
         assert opening.width * RESOLUTION_M >= 0.8 - 1e-9
@@ -92,7 +100,7 @@ def test_doors_are_wide_enough_and_free_on_both_sides(seed):
 
 @pytest.mark.parametrize("seed", range(40))
 def test_every_room_of_a_layout_is_joined_to_every_other(seed):
-    layout = draw_layout(np.random.default_rng(seed), hall=is_hall(seed))
+    layout = layout_of(seed)
     reached, grown = {0}, True
     while grown:
         pairs = [{o.first, o.second} for o in layout.openings]
@@ -117,10 +125,25 @@ def test_every_third_world_is_of_halls_large_high_and_bare():
 def test_most_halls_have_tape_on_their_floors():
     taped = []
     for seed in filter(is_hall, range(30)):
-        rooms = draw_layout(np.random.default_rng([seed, 7]), hall=True).rooms
+        rooms = layout_of(seed, 7).rooms
         world = generate(seed)
         taped.append(len(np.unique(world.floor_surface[~world.blocked])) > len(rooms) + 2)
     assert 5 <= sum(taped) < 10
+
+
+def test_depots_are_mostly_one_large_room_with_racks_out_of_reach():
+    seeds = DEPOT_SEEDS["validation"][:12]
+    assert not any(is_hall(seed) for seed in seeds)
+    layouts, worlds = [layout_of(seed, 7) for seed in seeds], [generate(seed) for seed in seeds]
+    assert all(world.name.startswith("depot") for world in worlds)
+    largest_m2 = [max(room.rect.area_m2 for room in layout.rooms) for layout in layouts]
+    assert np.median(largest_m2) > 250.0
+    racks = [(world.span_top_m > 3.0) & (world.span_bottom_m < 2.5) for world in worlds]
+    assert np.median([rack.sum() * RESOLUTION_M**2 for rack in racks]) > 2.0
+
+
+def test_no_world_to_test_in_is_a_depot():
+    assert not any(is_depot(seed) for seed in TEST_SEEDS)
 
 
 def test_seed_ranges_of_the_splits_do_not_meet():

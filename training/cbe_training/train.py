@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cbe.errors import ConfigError
-from cbe_hil_sim.generate import TRAIN_SEEDS
+from cbe_hil_sim.generate import DEPOT_SEEDS, TRAIN_SEEDS
 from cbe_training import losses, views
 from cbe_training.checkpoint import Learner
 from cbe_training.config import NOTHING_ELSE, Learn, Material, TrainConfig
@@ -62,8 +62,7 @@ def train(
         learner.load(folder)
         logger.info("resumed at iteration %d", learner.iteration)
     cache = folder.parent / "drives"
-    first = config.seed * config.worlds
-    seeds = TRAIN_SEEDS[first : first + config.worlds][team.rank :: team.size]
+    seeds = _seeds(config)[team.rank :: team.size]
     plans = furnished(material.plans)[team.rank :: team.size]
     drives = Drives.build(seeds, config.drives_per_world, cache, plans)
     footage = [Footage.load(path) for path in material.footage]
@@ -91,6 +90,15 @@ def train(
     if curve is not None:
         learner.save(folder)
         curve.draw()
+
+
+def _seeds(config: TrainConfig) -> list[int]:
+    """Of the worlds that a run with the config's seed learns in."""
+    worlds, depots = config.worlds, round(config.depots * config.worlds)
+    return [
+        *TRAIN_SEEDS[config.seed * worlds :][:worlds],
+        *DEPOT_SEEDS["train"][config.seed * depots :][:depots],
+    ]
 
 
 def iterate(
