@@ -229,7 +229,10 @@ def _follower_config(memory: Memory) -> FollowerConfig:
     usual = FollowerConfig()
     if memory is Memory.FULL:
         return usual
-    return replace(usual, lost=replace(usual.lost, stop=1.0, doubt_rest=1.0, apart_rest_m=math.inf))
+    unperturbed = replace(
+        usual.lost, stop=1.0, doubt_rest=1.0, apart_rest_m=math.inf, nearer_rest_m=-math.inf
+    )
+    return replace(usual, lost=unperturbed)
 
 
 @functools.cache

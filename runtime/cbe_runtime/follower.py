@@ -15,6 +15,7 @@ from cbe.parking import REACH_M
 from cbe.robot import STEP_S, Robot
 from cbe.signature import OVERRUN_M
 from cbe.stop_zone import limit
+from cbe_runtime.approach import Approach
 from cbe_runtime.behavior import Behavior
 from cbe_runtime.berth import Berth
 from cbe_runtime.caution import slowed
@@ -64,6 +65,7 @@ class Follower:
         self._config = config or FollowerConfig()
         self._controller = RmpController(self._robot)
         self._berth = Berth(self._robot, self._config.berth)
+        self._approach = Approach(self._config.approach)
         self._camera_watch = StampWatch(
             self._config.fresh_s, Reason.STALE_CAMERA, Reason.FROZEN_CAMERA
         )
@@ -226,6 +228,8 @@ class Follower:
         self._gap_steps, self._since_tick_steps = self._since_tick_steps, 0
         self._seen_stamp_ns = frame.stamp_ns
         self._prediction, self._waypoint_m = prediction, waypoint_m
+        if prediction is not None and self._behavior.pinned:
+            self._approach.read(float(prediction.end[0]))
 
     def _judge_progress(self, prediction: Prediction) -> None:
         """Start the next behavior, or arrive, once enough ticks in a row say so."""
@@ -287,14 +291,14 @@ class Follower:
         self._done_ticks = 0
         if self._berth.held_up:
             return  # by an obstacle: it goes on
-        lost, berth = self._config.lost, self._berth
+        lost, berth, seen = self._config.lost, self._berth, visible(image)
         sure = berth.most_doubt <= lost.doubt_rest
-        alike = berth.lowest <= lost.unlike_rest * visible(image) ** lost.narrow
-        if sure and alike and self._apart_m() <= lost.apart_rest_m:
+        alike = berth.lowest <= lost.unlike_rest * seen**lost.narrow
+        nearer = self._approach.nearer_m >= lost.nearer_rest_m or seen < lost.wide
+        if sure and alike and nearer and self._apart_m() <= lost.apart_rest_m:
             self._machine.update(Events(arrived=True))
             return
-        assert self._behavior.sight is not None
-        self._lose().give_up(self._behavior.sight)  # to look again it would drive on past the end
+        self._lose().give_up()  # to look again it would drive on past the end
 
     def _apart_m(self) -> float:
         """How far from where the view shows the end the waypoint, which runs past it, puts it."""
@@ -352,6 +356,7 @@ class Follower:
     def _join(self, hypothesis: Hypothesis) -> None:
         """Go on with a behavior that the robot was found to be on."""
         self._behavior, self._belief = hypothesis.behavior, hypothesis.belief
+        self._approach = Approach(self._config.approach)
         self._berth.taken = False
         self._done_ticks = 0
         self._age_steps = 0
@@ -360,6 +365,7 @@ class Follower:
     def _begin(self, segment: int) -> None:
         """Enter a segment with every recurrent state reset; its first frame is the next one."""
         self._behavior = Behavior(self._networks, self._route, segment)
+        self._approach = Approach(self._config.approach)
         if self._prediction is not None:  # what it said of the segment left behind
             self._prediction = replace(self._prediction, progress=0.0)
         self._berth.taken = False
@@ -409,6 +415,7 @@ class Follower:
         speed, yaw_rate = twist(self._motion, self._robot)
         turn_rad = float(yaw_rate[0]) * STEP_S
         travel_m = float(speed[0]) * STEP_S
+        self._approach.carry(travel_m)
         x = self._waypoint_m[0] - travel_m * math.cos(0.5 * turn_rad)
         y = self._waypoint_m[1] - travel_m * math.sin(0.5 * turn_rad)
         cos, sin = math.cos(turn_rad), math.sin(turn_rad)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from cbe.signature import OVERRUN_M
+from cbe_runtime.approach import ApproachConfig
 from cbe_runtime.berth import BerthConfig
 from cbe_runtime.joining import JoinConfig
 from cbe_runtime.lost import LostConfig
@@ -34,6 +35,7 @@ class FollowerConfig:
     lost: LostConfig = field(default_factory=LostConfig)
     join: JoinConfig = field(default_factory=JoinConfig)
     berth: BerthConfig = field(default_factory=BerthConfig)
+    approach: ApproachConfig = field(default_factory=ApproachConfig)
 
     def ends(self, prediction: Prediction, steps: int, *, last: bool) -> bool:
         """Whether a tick says that a behavior of so many steps, a route's last or not, is done."""

@@ -159,19 +159,19 @@ class Search:
         elif not self.failed:
             self._follow(Sight.of(self._networks, image, self._sight))
 
-    def give_up(self, sight: Sight) -> None:
-        """Not look before the view is another: `sight` did not suffice, and driving on may harm."""
-        self.failed, self._view = True, sight.attractor
+    def give_up(self) -> None:
+        """Not look before the view is another than the next: driving on from there may harm."""
+        self.failed = True
 
     def elsewhere(self, image: NDArray[np.uint8]) -> bool:
-        """Whether the view is another than that of the search's last frame.
+        """Whether the view is another than that of the search's last frame, or since it was given up.
 
         Raises:
             ModelError: an output is not finite.
         """
-        if self._view is None:
-            return True
         now = Sight.of(self._networks, image, None).attractor
+        if self._view is None:
+            self._view = now
         return float(unlikeness(now, self._view, 0)) > self._config.moved
 
     def _try(self, sight: Sight) -> None:

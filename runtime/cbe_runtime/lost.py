@@ -26,6 +26,8 @@ class LostConfig:
     narrow: float = 0.7  # less for a narrower camera: times the share it sees to this power
     doubt_rest: float = 0.02  # nor where it then was so probably off the route
     apart_rest_m: float = 0.3  # nor where view and waypoint at last put the end so far apart
+    nearer_rest_m: float = 0.1  # nor where it came no nearer than that over the `Approach`:
+    wide: float = 0.8  # a camera that sees less of the view than that reads too unsteadily to tell
 
 
 class LostBelief:

@@ -10,7 +10,7 @@ from cbe_runtime.networks import Networks, Prediction
 
 
 class Counting:
-    """Stands for `Networks`: drives ahead, a behavior being done after `ticks` ticks.
+    """Stands for `Networks`: drives ahead to an end 0.2 m nearer a tick, done after `ticks`.
 
     Keeps whether the attractors it was given at start and goal of a behavior were there.
     """
@@ -44,7 +44,7 @@ class Counting:
         if state == 0:
             self.given.append((bool(attractor_start.any()), bool(attractor_goal.any())))
         progress = 1.0 if state >= self.ticks else 0.0
-        end = np.array([0.0, 0.0, 1.0, 0.0])
+        end = np.array([0.2 * max(self.ticks - state, 0), 0.0, 1.0, 0.0])
         return Prediction(np.array([0.3, 0.0]), progress, self.on_route, end), state + 1
 
 

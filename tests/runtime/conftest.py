@@ -93,13 +93,14 @@ def attractor_nodes(rng):
 def generator_nodes(ticks_to_goal, waypoint_m):
     """Progress counts ticks since the behavior began; the waypoint is always straight ahead.
 
-    It is always sure to be on the route, and sees the end 0.3 m before the waypoint.
+    It is always sure to be on the route, and sees the end come nearer until progress is 1.
     """
     weights = {
         "one": np.float32([[1.0]]),
         "rate": np.full((STATE, 1), 1.0 / STATE / ticks_to_goal, np.float32),
         "ahead": np.float32([list(waypoint_m)]),
-        "end_pose": np.float32([[waypoint_m[0] - signature.OVERRUN_M, waypoint_m[1], 1.0, 0.0]]),
+        "end_pose": np.float32([[0.0, waypoint_m[1], 1.0, 0.0]]),
+        "left": np.float32([[4.0, 0.0, 0.0, 0.0]]),
         "zero": np.float32([0.0]),
         "flat": np.array([1], np.int64),
         "sure": np.float32([5.0]),
@@ -114,7 +115,11 @@ def generator_nodes(ticks_to_goal, waypoint_m):
         helper.make_node("ReduceMean", ["all"], ["used"], axes=[1], keepdims=0),
         helper.make_node("Mul", ["used", "zero"], ["nothing"]),
         helper.make_node("Add", ["ahead", "nothing"], ["waypoint_m"]),
-        helper.make_node("Add", ["end_pose", "nothing"], ["end"]),
+        helper.make_node("Sub", ["one", "share"], ["undone"]),
+        helper.make_node("Relu", ["undone"], ["still_undone"]),
+        helper.make_node("Mul", ["still_undone", "left"], ["farther"]),
+        helper.make_node("Add", ["end_pose", "farther"], ["farther_end"]),
+        helper.make_node("Add", ["farther_end", "nothing"], ["end"]),
         helper.make_node("Add", ["nothing", "sure"], ["on_route_logit"]),
         helper.make_node("Sigmoid", ["on_route_logit"], ["on_route"]),
     ]

@@ -117,7 +117,7 @@ def test_single_tick_of_high_progress_does_not_switch(drive, monkeypatch):
 def _saying(drive, monkeypatch, segment=1, **said):
     """Have the generator say this from now on; the route's last segment is 1.
 
-    Where only the end is said, the waypoint lies beyond it.
+    Where only the end is said, the waypoint lies beyond it. What is said can be changed later.
     """
     if "end" in said:
         x, y, cos, sin = said["end"]
@@ -131,6 +131,7 @@ def _saying(drive, monkeypatch, segment=1, **said):
         return replace(prediction, **said), state
 
     monkeypatch.setattr(Networks, "generate", fixed)
+    return said
 
 
 @pytest.mark.parametrize(
@@ -174,6 +175,11 @@ def test_stalled_progress_switches_where_the_waypoint_says_rest(drive, monkeypat
     assert drive.step(6).segment == 1
 
 
+NEAR_END = np.array([0.2, 0.0, 1.0, 0.0])
+STEADFAST = FollowerConfig(berth=BerthConfig(trust=0.0))
+"""Parks where it first saw the end: a fixed one moves on with the robot."""
+
+
 def _parks(drive):
     """Step until the robot is on its way to its berth."""
     for _ in range(2 * 40):
@@ -189,9 +195,9 @@ def _is_lost_and_never_arrives(drive):
     assert State.ARRIVED not in states
 
 
-def test_arrives_once_it_stands_where_it_sees_the_end(networks, route):
-    steadfast = FollowerConfig(berth=BerthConfig(trust=0.0))  # the end that it sees moves with it
-    drive = Drive(Follower(networks, route, config=steadfast))
+def test_arrives_once_it_stands_where_it_sees_the_end(networks, route, monkeypatch):
+    drive = Drive(Follower(networks, route, config=STEADFAST))
+    _saying(drive, monkeypatch, progress=1.0, end=NEAR_END)
     decision = _parks(drive)
     assert decision.segment == 1
     speeds = [decision.speed_mps]
@@ -226,14 +232,14 @@ def test_robot_that_stands_where_nothing_looks_like_the_end_is_lost(drive, monke
 
 
 def test_robot_that_stands_hardly_sure_to_be_on_the_route_is_lost(drive, monkeypatch):
-    _saying(drive, monkeypatch, progress=1.0, on_route=0.9)
+    _saying(drive, monkeypatch, progress=1.0, on_route=0.9, end=NEAR_END)
     _parks(drive)
     _is_lost_and_never_arrives(drive)
 
 
 def test_one_view_unsure_of_the_route_while_parking_is_enough_to_be_lost(drive, monkeypatch):
     with monkeypatch.context() as patch:
-        _saying(drive, patch, progress=1.0, on_route=0.9)
+        _saying(drive, patch, progress=1.0, on_route=0.9, end=NEAR_END)
         _parks(drive)
     _is_lost_and_never_arrives(drive)
 
@@ -252,6 +258,18 @@ def test_robot_that_stands_where_two_readings_of_the_end_disagree_is_lost(
     assert (later.state, later.speed_mps) == (state, 0.0)  # nor does it drive on to look again
 
 
+@pytest.mark.parametrize(("before_m", "state"), [(0.9, State.ARRIVED), (0.25, State.LOST)])
+def test_robot_is_lost_where_the_end_comes_no_nearer_however_far_it_drives(
+    networks, route, monkeypatch, before_m, state
+):
+    drive = Drive(Follower(networks, route, config=STEADFAST))
+    said = _saying(drive, monkeypatch, progress=0.5, end=np.array([before_m, 0.0, 1.0, 0.0]))
+    drive.step(40)
+    said["progress"], said["end"] = 1.0, NEAR_END
+    said["waypoint_m"] = np.array([NEAR_END[0] + OVERRUN_M, 0.0])
+    assert drive.step(40).state is state
+
+
 @pytest.mark.parametrize(("share", "state"), [(1.0, State.ARRIVED), (0.5, State.LOST)])
 def test_narrower_camera_must_see_its_end_more_alike(drive, monkeypatch, share, state):
     _parks(drive)
@@ -263,8 +281,9 @@ def test_narrower_camera_must_see_its_end_more_alike(drive, monkeypatch, share, 
     assert decision.state is state
 
 
-def test_robot_held_up_on_its_last_metre_goes_on(drive, monkeypatch):
-    _saying(drive, monkeypatch, progress=1.0, end=np.array([0.5, 0.0, 1.0, 0.0]))
+def test_robot_held_up_on_its_last_metre_goes_on(networks, route, monkeypatch):
+    drive = Drive(Follower(networks, route, config=STEADFAST))
+    _saying(drive, monkeypatch, progress=1.0, end=np.array([0.3, 0.0, 1.0, 0.0]))
     _parks(drive)
     for range_m, state in ((0.1, State.FOLLOWING), (5.0, State.ARRIVED)):
         for _ in range(40):

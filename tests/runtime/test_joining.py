@@ -138,6 +138,15 @@ def test_moved_robot_is_told_from_one_that_stands(networks, route, says):
     assert search.elsewhere(OTHER)
 
 
+def test_search_that_was_given_up_waits_for_another_view_than_the_next(networks, route):
+    search = search_of(networks, route_of(route, 4), config=JoinConfig(moved=0.001))
+    search.give_up()
+    assert search.failed
+    assert not search.elsewhere(IMAGE)  # where the robot stands
+    assert not search.elsewhere(IMAGE)
+    assert search.elsewhere(OTHER)
+
+
 def test_share_of_the_route_counts_steps(route):
     uneven = replace(route, segments=tuple(replace(s, steps=n) for s, n in zip(
         route.segments, (10, 30), strict=True)))  # fmt: skip
