@@ -164,7 +164,9 @@ class Search:
         self.failed = True
 
     def elsewhere(self, image: NDArray[np.uint8]) -> bool:
-        """Whether the view is another than that of the search's last frame, or since it was given up.
+        """Whether the view is another than that of the search's last frame.
+
+        Of a search that was given up, than that of the first frame since.
 
         Raises:
             ModelError: an output is not finite.
