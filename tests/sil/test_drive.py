@@ -77,9 +77,8 @@ def test_taught_drive_is_repeated_in_lockstep(
     heading = math.atan2(*(straight[1] - straight[0])[::-1])
     pose = [*straight[0].tolist(), heading]
     _, link = simulator("--lockstep", "--start=" + ",".join(map(str, pose)))
-    # 65 steps until this model, which always drives straight on, believes that its end is near, and
-    # 0.9 m until it gives up to reach that, which it always sees 0.2 m ahead.
-    model = make_model(tmp_path / "model", ticks_to_goal=34.0, **{"cbe.segment_steps": "100"})
+    # 80 steps until this model, which always drives straight on, believes that its end is near.
+    model = make_model(tmp_path / "model", ticks_to_goal=41.0, **{"cbe.segment_steps": "100"})
     route, poses = taught(start, endpoint, link, until, straight, model, tmp_path)
     link.call("reset", {"pose": pose}, CALL_S)
 
