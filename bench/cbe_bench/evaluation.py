@@ -229,10 +229,10 @@ def _follower_config(memory: Memory) -> FollowerConfig:
     usual = FollowerConfig()
     if memory is Memory.FULL:
         return usual
-    unperturbed = replace(
+    never_lost = replace(
         usual.lost, stop=1.0, doubt_rest=1.0, apart_rest_m=math.inf, nearer_rest_m=-math.inf
     )
-    return replace(usual, lost=unperturbed)
+    return replace(usual, lost=never_lost)
 
 
 @functools.cache
