@@ -313,9 +313,12 @@ def high_rack(rng: Rng) -> Piece:
     """A long row of pallet racks, up to thrice as high as a person can reach."""
     w, d = rng.uniform(2.5, 12.0), rng.uniform(0.8, 1.3)
     steel, low = pick(rng, "lacquer"), rng.uniform(0.0, 1.4)
-    gap = low + rng.uniform(0.3, 1.0)
-    top = gap + rng.uniform(0.8, 5.0)
-    below, above = pick(rng, "box", "bookshelf"), pick(rng, "box", "bookshelf", "photo")
+    if rng.random() < 0.4:
+        low, gap = 0.0, rng.uniform(1.2, 2.6)  # one sees through below
+    else:
+        gap = low + rng.uniform(0.3, 1.0)
+    top = gap + rng.uniform(0.3, 5.0)
+    below, above = pick(rng, "box", "bookshelf"), pick(rng, "box", "bookshelf", "photo", "lacquer")
     parts = [Part(0.0, 0.0, w, d, gap, top, above, above)]
     if low > 0.3:
         parts += [Part(0.0, 0.0, w - 0.2, d - 0.1, 0.0, low, below, below)]
@@ -335,6 +338,7 @@ class Set:
     free: tuple[Factory, ...]
     density: float = 1.0  # scales the number of fillers
     windows: float = 0.35  # a metre of outer wall
+    rows: float = 0.0  # chance that racks stand in rows
 
 
 _CLUTTER = (plant, boxes, crate, stool, bin_, floor_lamp)
@@ -369,7 +373,7 @@ SETS: dict[str, Set] = {
     ),
     "depot": Set(
         (), (high_rack, high_rack, shelving, stack, boxes),
-        (high_rack, high_rack, high_rack, stack, crate, boxes, column, divider), 0.15, 0.03,
+        (high_rack, high_rack, high_rack, stack, crate, boxes, column, divider), 0.15, 0.03, 0.7,
     ),
     "meeting": Set(
         (), (cabinet, low_shelf, plant, television, bench), (dining_table, screen_wall),

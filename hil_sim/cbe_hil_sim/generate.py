@@ -24,6 +24,23 @@ HALL_EVERY = 3
 DEPOT_SEEDS = {"train": TRAIN_SEEDS[90_000:], "validation": VALIDATION_SEEDS[9_000:]}
 """Worlds of depots; there are none to test in, for warehouses of others' making do that."""
 
+
+@dataclass(frozen=True, slots=True)
+class Marks:
+    """How floors of a kind of room are taped."""
+
+    chance: float  # that there are any
+    zones: tuple[int, int]  # a room, the second excluded
+    lanes: float  # share of the zones
+    widest_m: float
+
+
+MARKS = {
+    "hall": Marks(0.7, (1, 10), 0.6, 6.0),
+    # A lane along which one drives looks as if one stood.
+    "depot": Marks(0.9, (4, 20), 0.85, 3.0),
+}
+
 Rng = np.random.Generator
 Heights = NDArray[np.float32]
 Rows = NDArray[np.uint16]
@@ -151,22 +168,20 @@ class Builder:
         if rng.random() < 0.4 and min(rect.width, rect.height) > 40:
             rug = self._somewhere(rect, (1.0, 3.2), 4)
             self.floor[rug.slices] = self._fitted(pick(rng, "rug"), rug, look.tint)
-        kind = self.layout.rooms[index].kind
-        if kind in {"hall", "depot"} and rng.random() < 0.7:
-            # A lane along which one drives looks as if one stood.
-            zones, lanes = ((1, 10), 0.6) if kind == "hall" else ((4, 16), 0.85)
-            self._mark_floor(rect, look.tint, zones, lanes)
+        marks = MARKS.get(self.layout.rooms[index].kind)
+        if marks is not None and rng.random() < marks.chance:
+            self._mark_floor(rect, look.tint, marks)
 
-    def _mark_floor(self, rect: Rect, light: Tint, zones: tuple[int, int], lanes: float) -> None:
-        """Tape outlines onto a hall's floor, of zones, a share of them lanes from wall to wall."""
+    def _mark_floor(self, rect: Rect, light: Tint, marks: Marks) -> None:
+        """Tape outlines of zones onto a floor, a share of them lanes from wall to wall."""
         rng, paint = self.rng, pick(self.rng, "plain_ceiling")
         tapes = [
             self.table.add(paint, (3.0, 3.0), light * colour(rng, (0.0, 0.9), (0.1, 0.9)) / 255.0)
             for _ in range(int(rng.integers(1, 4)))
         ]
-        for _ in range(int(rng.integers(*zones))):
-            zone = self._somewhere(rect, (0.6, 6.0), 2)
-            if rng.random() < lanes:
+        for _ in range(int(rng.integers(*marks.zones))):
+            zone = self._somewhere(rect, (0.6, marks.widest_m), 2)
+            if rng.random() < marks.lanes:
                 x, y = (rect, zone) if rng.random() < 0.5 else (zone, rect)
                 zone = Rect(x.x0, y.y0, x.x1, y.y1)
             floor, width = self.floor[zone.slices], int(rng.integers(1, 4))

@@ -103,6 +103,8 @@ class Placer:
             for side in range(first, first + 4):
                 if self._at_wall(index, piece, side % 4):
                     break
+        if content.rows and rng.random() < content.rows:
+            self._rows(index)
         # Some homes are full and some nearly empty.
         density = content.density * rng.uniform(0.3, 1.3)
         for _ in range(int(rng.poisson(0.3 * rect.area_m2 * density))):
@@ -111,6 +113,31 @@ class Placer:
         for _ in range(int(rng.poisson(1.1 * perimeter_m * density))):
             piece = content.walls[int(rng.integers(len(content.walls)))](rng)
             self._at_wall(index, piece, int(rng.integers(4)))
+
+    def _rows(self, index: int) -> None:
+        """Stand racks in rows, with aisles between them along which one drives."""
+        rng, rect = self.rng, self.layout.rooms[index].rect
+        along_x, filled = bool(rng.random() < 0.5), rng.uniform(0.2, 0.9)
+        length, across = (rect.width, rect.height) if along_x else (rect.height, rect.width)
+        aisle = to_cells(rng.uniform(1.6, 4.0))
+        row = aisle
+        while row + 2 * WALKWAY < across - aisle:
+            column, deepest = 2 * WALKWAY, 0
+            while column < length - 2 * WALKWAY:
+                piece, angle = furniture.high_rack(rng), math.pi * int(rng.integers(2))
+                width, depth = to_cells(piece.width_m), to_cells(piece.depth_m)
+                x, y, dx, dy = column, row, width, depth
+                if not along_x:
+                    x, y, dx, dy, angle = y, x, dy, dx, angle + 0.5 * math.pi
+                x, y = rect.x0 + x, rect.y0 + y
+                box = Rect(x, y, x + dx, y + dy)
+                column += width + WALKWAY * int(rng.integers(3))
+                fits = column < length - 2 * WALKWAY and self._fits(box, piece)
+                if fits and rng.random() < filled:
+                    self._put(index, piece, box, angle)
+                    self.used[box.slices] = True
+                    deepest = max(deepest, depth)
+            row += deepest + aisle
 
     def _outside(self, rect: Rect, side: int) -> bool:
         """Whether the wall at `side` (left, right, bottom, top) is an outer wall."""

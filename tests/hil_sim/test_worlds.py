@@ -143,6 +143,19 @@ def test_depots_are_mostly_one_large_room_with_racks_out_of_reach():
     assert np.median([rack.sum() * RESOLUTION_M**2 for rack in racks]) > 2.0
 
 
+def test_racks_of_depots_stand_in_rows_and_most_floors_have_lanes_from_wall_to_wall():
+    filled, laned = [], 0
+    for seed in DEPOT_SEEDS["validation"][:12]:
+        room = max(layout_of(seed, 7).rooms, key=lambda room: room.rect.area_m2).rect
+        world = generate(seed)
+        racks, floor = (world.span_top_m > 3.0)[room.slices], world.floor_surface[room.slices]
+        filled.append(max(racks.mean(axis=axis)[40:-40].max() for axis in (0, 1)))
+        common = np.bincount(floor.ravel()).argmax()
+        laned += any((floor != common).mean(axis=axis).max() > 0.9 for axis in (0, 1))
+    assert np.median(filled) > 0.45
+    assert laned >= 6
+
+
 def test_no_world_to_test_in_is_a_depot():
     assert not any(is_depot(seed) for seed in TEST_SEEDS)
 

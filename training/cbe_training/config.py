@@ -61,7 +61,7 @@ class TrainConfig:
 
     seed: int = 0
     worlds: int = 100
-    depots: float = 0.4  # and so many more, times that, of these
+    depots: float = 0.6  # and so many more, times that, of these
     drives_per_world: int = 25
     demonstrations: int = 48  # behaviors shown in one iteration
     repeats: int = 2  # rollouts of each, from different starts
