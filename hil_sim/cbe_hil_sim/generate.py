@@ -69,6 +69,11 @@ def is_depot(seed: int) -> bool:
     return any(seed in seeds for seeds in DEPOT_SEEDS.values())
 
 
+def style_of(seed: int) -> Style | None:
+    """What `draw_layout` is told of the world of `seed`; None for homes and offices."""
+    return DEPOT if is_depot(seed) else HALL if is_hall(seed) else None
+
+
 TEST_HOUSES = [seed for seed in TEST_SEEDS if not is_hall(seed)]
 """Test worlds of many rooms, with ways through several doors."""
 
@@ -83,7 +88,7 @@ def generate(seed: int) -> World:
     """
     split = split_of(seed)
     rng = np.random.default_rng([seed, 7])
-    style = DEPOT if is_depot(seed) else HALL if is_hall(seed) else None
+    style = style_of(seed)
     layout = draw_layout(rng, style)
     ceiling_m = rng.uniform(*_ceiling_m(style))
     builder = Builder(layout, rng, round(float(ceiling_m), 2))

@@ -15,8 +15,9 @@ from cbe_hil_sim.generate import (
     is_depot,
     is_hall,
     split_of,
+    style_of,
 )
-from cbe_hil_sim.layout import DEPOT, HALL, draw_layout
+from cbe_hil_sim.layout import draw_layout
 from cbe_hil_sim.world import BLOCKING_HEIGHT_M, RESOLUTION_M
 
 SEEDS = [*range(20), 100_000, 108_999, 200_000, 209_999, *DEPOT_SEEDS["train"][:5]]
@@ -24,8 +25,7 @@ SEEDS = [*range(20), 100_000, 108_999, 200_000, 209_999, *DEPOT_SEEDS["train"][:
 
 def layout_of(seed, *more):
     """As `generate` draws it for `more` of 7."""
-    style = DEPOT if is_depot(seed) else HALL if is_hall(seed) else None
-    return draw_layout(np.random.default_rng([seed, *more]), style)
+    return draw_layout(np.random.default_rng([seed, *more]), style_of(seed))
 
 
 @pytest.fixture(scope="module", params=SEEDS)
