@@ -124,10 +124,14 @@ class OurTick:
         rng = np.random.default_rng(0)
         shape = (16, signature.IMAGE_SIZE, signature.IMAGE_SIZE, 3)
         self._images = rng.integers(0, 256, shape, dtype=np.uint8)
-        self._attractors = rng.random((3, signature.ATTRACTOR_SIZE), np.float32)
-        self._goal = rng.standard_normal(signature.EMBEDDING_SIZE, np.float32)
+        first, start, goal = rng.random((3, signature.ATTRACTOR_SIZE), np.float32)
         self._encoder = networks.encoder_state()
-        self._generator = networks.generator_state()
+        self._generator = networks.recall(
+            attractor_first=first,
+            attractor_start=start,
+            attractor_goal=goal,
+            embedding_goal=rng.standard_normal(signature.EMBEDDING_SIZE, np.float32),
+        )
         self._count = 0
 
     def __call__(self) -> None:
@@ -136,15 +140,8 @@ class OurTick:
         image = self._images[self._count % len(self._images)]
         self._count += 1
         features, embedding, self._encoder = networks.encode(image, self._encoder)
-        first, start, goal = self._attractors
         _, self._generator = networks.generate(
-            attractor_now=networks.attract(features),
-            attractor_first=first,
-            attractor_start=start,
-            attractor_goal=goal,
-            embedding_now=embedding,
-            embedding_goal=self._goal,
-            state=self._generator,
+            networks.attract(features), embedding, self._generator
         )
 
 

@@ -1,6 +1,6 @@
 """Names, shapes and types of the ONNX graphs and of their metadata.
 
-Three drive; `shape` tells how a route goes on past a joint, and may be missing.
+Four drive; `shape` tells how a route goes on past a joint, and may be missing.
 
 The one place that names them: the exporter writes to it and the runtime refuses what differs.
 Batch 1, one tick, every recurrent state explicit (paper, Sec. III-B to III-D).
@@ -8,7 +8,10 @@ Batch 1, one tick, every recurrent state explicit (paper, Sec. III-B to III-D).
 
 from dataclasses import dataclass
 
-CONTRACT_VERSION = 2
+CONTRACT_VERSION = 3
+"""Of the tensors below and what they mean; a folder of another version is refused."""
+PREPROCESSING_VERSION = 2
+"""Of how a view becomes numbers; part of the model id, by which a route knows its model."""
 
 IMAGE_SIZE = 64
 FEATURES = (32, 16, 16)
@@ -41,24 +44,17 @@ class Graph:
 def encoder(state_size: int) -> Graph:
     """Behavior encoder of one image (1, 64, 64, 3) uint8 RGB.
 
-    `is_first` is 1 on a behavior's first frame, whose state inputs are ignored;
-    `embedding` is z of the frames seen since then (32 numbers).
+    `state` is all zeros at a behavior's first frame; `embedding` is z of the frames seen since
+    then (32 numbers).
     """
     state = (1, state_size)
     return Graph(
         "encoder",
-        (
-            Tensor("image", (1, IMAGE_SIZE, IMAGE_SIZE, 3), "tensor(uint8)"),
-            Tensor("previous_features", (1, *FEATURES)),
-            Tensor("is_first", (1,)),
-            Tensor("h", state),
-            Tensor("c", state),
-        ),
+        (Tensor("image", (1, IMAGE_SIZE, IMAGE_SIZE, 3), "tensor(uint8)"), Tensor("state", state)),
         (
             Tensor("features", (1, *FEATURES)),
             Tensor("embedding", (1, EMBEDDING_SIZE)),
-            Tensor("h_next", state),
-            Tensor("c_next", state),
+            Tensor("state_next", state),
         ),
     )
 
@@ -72,30 +68,43 @@ def attractor() -> Graph:
     )
 
 
-def generator(state_size: int) -> Graph:
+def recall(recalled_size: int) -> Graph:
+    """What of the generator's work stays the same while a behavior lasts, done at its first frame.
+
+    `attractor_first` is that frame's; the others are what is remembered of the demonstration.
+    """
+    attractors = ("attractor_first", "attractor_start", "attractor_goal")
+    return Graph(
+        "recall",
+        (
+            *(Tensor(name, (1, ATTRACTOR_SIZE)) for name in attractors),
+            Tensor("embedding_goal", (1, EMBEDDING_SIZE)),
+        ),
+        (Tensor("recalled", (1, recalled_size)),),
+    )
+
+
+def generator(state_size: int, recalled_size: int) -> Graph:
     """Waypoint generator: `waypoint_m` is x, y in base_link; progress runs 0 to 1.
 
     `on_route` is the probability of being within 1 m of the demonstration. `end` is x, y, cos, sin
     of the behavior's last pose in base_link, as far as `attractor_now` shows it.
     """
     state = (1, state_size)
-    attractors = ("attractor_now", "attractor_first", "attractor_start", "attractor_goal")
     return Graph(
         "generator",
         (
-            *(Tensor(name, (1, ATTRACTOR_SIZE)) for name in attractors),
+            Tensor("recalled", (1, recalled_size)),
+            Tensor("attractor_now", (1, ATTRACTOR_SIZE)),
             Tensor("embedding_now", (1, EMBEDDING_SIZE)),
-            Tensor("embedding_goal", (1, EMBEDDING_SIZE)),
-            Tensor("h", state),
-            Tensor("c", state),
+            Tensor("state", state),
         ),
         (
             Tensor("waypoint_m", (1, 2)),
-            Tensor("progress", (1,)),
-            Tensor("on_route", (1,)),
+            Tensor("progress", (1, 1)),
+            Tensor("on_route", (1, 1)),
             Tensor("end", (1, 4)),
-            Tensor("h_next", state),
-            Tensor("c_next", state),
+            Tensor("state_next", state),
         ),
     )
 

@@ -85,7 +85,7 @@ def export(
 
 def identify(networks: BehaviorNetworks, precision: str = "fp32") -> str:
     """16 hex digits that change with the weights, the preprocessing or the quantisation."""
-    digest = hashlib.sha256(f"{signature.CONTRACT_VERSION} {_camera()} {precision}".encode())
+    digest = hashlib.sha256(f"{signature.PREPROCESSING_VERSION} {_camera()} {precision}".encode())
     for name, value in sorted(networks.state_dict().items()):
         digest.update(name.encode())
         digest.update(value.cpu().numpy().tobytes())

@@ -7,88 +7,78 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from cbe import signature
+from cbe_export.folded import conv, gates, linear, lstm_step, normalised
+from cbe_export.generation import GeneratorTick, RecallTick, recalled_size
 from cbe_training import path
-from cbe_training.layout import path_of
-from cbe_training.networks import BehaviorNetworks, Remembered
-from cbe_training.vision import Pair
-
-PATH = 3 + 2 * path.DEGREES + 1  # numbers of a `path.Path`
-
-
-class LstmCell(nn.Module):
-    """One step of an LSTM as a single matrix product, which onnxruntime can also quantise."""
-
-    def __init__(self, lstm: nn.LSTM) -> None:
-        super().__init__()
-        stored = lstm.state_dict()
-        weights = torch.cat([stored["weight_ih_l0"], stored["weight_hh_l0"]], dim=1)
-        self.gates = nn.Linear(weights.shape[1], weights.shape[0])
-        self.gates.weight = nn.Parameter(weights)
-        self.gates.bias = nn.Parameter(stored["bias_ih_l0"] + stored["bias_hh_l0"])
-
-    def forward(self, x: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
-        """Input (1, I) and state (1, S) twice, to the next state."""
-        keep_in, forget, new, out = self.gates(torch.cat([x, h], dim=1)).chunk(4, dim=1)
-        c = torch.sigmoid(forget) * c + torch.sigmoid(keep_in) * torch.tanh(new)
-        return torch.sigmoid(out) * torch.tanh(c), c
-
-
-class PairTick(nn.Module):
-    """Motion features of one pair of frames, both through one convolution side by side."""
-
-    def __init__(self, pair: Pair) -> None:
-        super().__init__()
-        stored = pair.first.state_dict()
-        weights = torch.cat(stored["weight"].chunk(2), dim=1)  # of now, then of the frame before
-        self.first = nn.Conv2d(weights.shape[1], weights.shape[0], 3, stride=2, padding=1)
-        self.first.weight = nn.Parameter(weights)
-        self.first.bias = nn.Parameter(sum(stored["bias"].chunk(2)))
-        self.rest = pair.rest
-
-    def forward(self, features: Tensor, previous: Tensor) -> Tensor:
-        """Features (1, 32, 16, 16) of a frame and of the one before, to (1, motion)."""
-        return self.rest(self.first(torch.cat([features, previous], dim=1)))
+from cbe_training.layout import TRACED, path_of
+from cbe_training.networks import STEP_SCALE, BehaviorNetworks, Encoder
 
 
 class EncoderTick(nn.Module):
-    """Graph `encoder`; the path travels as the last numbers of `h`."""
+    """Graph `encoder`; the state is all that `cbe_training.networks.Encoder` carries, in a row.
+
+    The path is in the units of z, and of the frame before is kept what its convolution adds.
+    """
 
     def __init__(self, networks: BehaviorNetworks) -> None:
         super().__init__()
-        self.trunk = networks.trunk
-        self.encoder = networks.encoder
-        self.pair = PairTick(networks.encoder.pair)
-        self.lstm = LstmCell(networks.encoder.lstm)
+        encoder = networks.encoder
+        self.stem = networks.trunk.stem
+        self.pair = encoder.pair
+        self.odometry = _odometry(encoder)
+        self.gates = gates(encoder.lstm)
+        self.embed = _embed(encoder)
+        self.sizes = state_sizes(networks)
+        self.quarters = path.QUARTERS.float()
+        recursion = path.RECURSION.unflatten(-1, (path.DEGREES + 1, path.DEGREES))
+        halved = torch.ones(path.DEGREES + 1, 1)
+        halved[-1] = 0.5  # of the two ends of a step comes the point midway
+        self.recursion = halved * recursion
 
-    def forward(
-        self, image: Tensor, previous_features: Tensor, is_first: Tensor, h: Tensor, c: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def forward(self, image: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """See `cbe.signature.encoder`."""
-        features = F.relu(self.trunk.stem(_normalised(image)))
-        previous = torch.where(is_first.view(1, 1, 1, 1) > 0.0, features, previous_features)
-        # A new behavior starts from nothing, whatever state was passed in.
-        again = 1.0 - is_first
-        h, c = again * h, again * c
-        size = h.shape[1] - PATH
-        h, pose, series, frames = h.split([size, 3, 2 * path.DEGREES, 1], dim=1)
-        c, spare = c.split([size, PATH], dim=1)
-        motion = self.pair(features, previous)
-        before = path.Path(pose, series.view(1, 2, path.DEGREES), frames)
-        after = path.advance(before, again * self.encoder.step(motion))
-        h, c = self.lstm(torch.cat([motion, path.place(after.pose)], dim=1), h, c)
-        embedding = self.encoder.embed(h, after.pose, after.series)
-        h = torch.cat([h, after.pose, after.series.flatten(1), after.frames], dim=1)
-        return features, embedding, h, torch.cat([c, spare], dim=1)
+        h, start, _, series, c, yaw, frames, kept = state.split(self.sizes, dim=1)
+        seen = frames.clamp(max=1.0)
+        features = F.relu(self.stem(normalised(image)))
+        now, before = self.pair.first(features).chunk(2, dim=1)
+        previous = kept.view(before.shape) + (1.0 - seen) * before  # the first is its own
+        motion = self.pair.rest(now + previous)
+        move, turn = (seen * self.odometry(motion)).split([2, 1], dim=1)
+        x_y = start + move @ (yaw + self.quarters).cos()
+        yaw = yaw + turn
+        direction = (yaw + self.quarters[:1]).cos()
+        frame = frames.clamp(max=path.LONGEST - 1).long().view(1)
+        points = torch.cat([series.view(2, -1), (start + x_y).view(2, 1)], dim=1)
+        series = (points @ self.recursion.index_select(0, frame)).view(1, -1)
+        h, c = lstm_step(self.gates(torch.cat([motion, x_y, direction, h], dim=1)), c)
+        h = torch.cat([h, x_y, direction, series], dim=1)
+        state = torch.cat([h, c, yaw, frames + 1.0, before.flatten(1)], dim=1)
+        return features, self.embed(h), state
 
 
-def _normalised(image: Tensor) -> Tensor:
-    """As `Trunk.forward` has it, x / 64 - 2, in one node."""
-    batch, height, width, colours = image.shape
-    return torch.onnx.ops.symbolic(
-        "DequantizeLinear",
-        (image.permute(0, 3, 1, 2), torch.tensor(1.0 / 64.0), torch.tensor(128, dtype=torch.uint8)),
-        dtype=torch.float32,
-        shape=(batch, colours, height, width),
+def state_sizes(networks: BehaviorNetworks) -> list[int]:
+    """Of the parts of the encoder's state."""
+    size, (kept, _) = networks.config.encoder_state, networks.config.pair_channels
+    return [size, 2, 2, 2 * path.DEGREES, size, 1, 1, kept * math.prod(signature.FEATURES[1:]) // 4]
+
+
+def _odometry(encoder: Encoder) -> nn.Sequential:
+    """`Encoder.step` with moves in the units of z."""
+    stored = encoder.odometry.state_dict()
+    units = STEP_SCALE * torch.tensor([path.PLACE_M, path.PLACE_M, 1.0])
+    return nn.Sequential(
+        linear(stored["0.weight"], stored["0.bias"]),
+        nn.ReLU(),
+        linear(stored["2.weight"] / units[:, None], stored["2.bias"] / units),
+    )
+
+
+def _embed(encoder: Encoder) -> nn.Linear:
+    """`Encoder.embed` in one product: what z says of the path passes through as it is."""
+    stored = encoder.to_embedding.state_dict()
+    passed = torch.eye(stored["weight"].shape[1])[-TRACED:]
+    return linear(
+        torch.cat([passed, stored["weight"]]), torch.cat([torch.zeros(TRACED), stored["bias"]])
     )
 
 
@@ -99,79 +89,17 @@ class AttractorTick(nn.Module):
         super().__init__()
         first, _, second = networks.attractor.layers.children()
         weight = second.get_parameter("weight")  # (8, width, 4, 7)
-        outputs, width, rows, columns = weight.shape
+        outputs, _, rows, _ = weight.shape
         # Few outputs leave a convolution idle, so each row of the kernel gets its own, and a
         # second one adds them up.
-        each = nn.Conv2d(width, rows * outputs, (1, columns), bias=False)
-        each.weight = nn.Parameter(weight.permute(2, 0, 1, 3).flatten(0, 1)[:, :, None])
-        together = nn.Conv2d(rows * outputs, outputs, (rows, 1))
+        each = conv(weight.permute(2, 0, 1, 3).flatten(0, 1)[:, :, None], None)
         adding = torch.einsum("op,kl->okpl", torch.eye(outputs), torch.eye(rows))
-        together.weight = nn.Parameter(adding.flatten(1, 2)[..., None])
-        together.bias = nn.Parameter(second.get_parameter("bias"))
+        together = conv(adding.flatten(1, 2)[..., None], second.get_parameter("bias"))
         self.layers = nn.Sequential(first, nn.ReLU(), each, together, nn.Sigmoid(), nn.Flatten())
 
     def forward(self, features: Tensor) -> Tensor:
         """See `cbe.signature.attractor`."""
         return self.layers(features)
-
-
-class GeneratorTick(nn.Module):
-    """Graph `generator`; what stays the same while a behavior lasts travels in `h`.
-
-    It is worked out on the behavior's first tick, whose state is all zeros, and only then.
-    """
-
-    def __init__(self, networks: BehaviorNetworks) -> None:
-        super().__init__()
-        self.generator = networks.generator
-        self.lstm = LstmCell(networks.generator.lstm)
-        self.shapes = remembered_shapes(networks)
-
-    def forward(
-        self,
-        attractor_now: Tensor,
-        attractor_first: Tensor,
-        attractor_start: Tensor,
-        attractor_goal: Tensor,
-        embedding_now: Tensor,
-        embedding_goal: Tensor,
-        h: Tensor,
-        c: Tensor,
-    ) -> tuple[Tensor, ...]:
-        """See `cbe.signature.generator`."""
-        sizes = [1, *(math.prod(shape) for shape in self.shapes)]
-        kept_size = sum(sizes)
-        h, kept = h.split([h.shape[1] - kept_size, kept_size], dim=1)
-        c, spare = c.split([c.shape[1] - kept_size, kept_size], dim=1)
-        kept = torch.cond(
-            kept[0, 0] > 0.0,
-            lambda kept, *_: kept.clone(memory_format=torch.contiguous_format),
-            lambda _, *arguments: self._remember(*arguments),
-            (kept, attractor_first, attractor_start, embedding_goal),
-        )
-        parts = kept.split(sizes, dim=1)[1:]
-        remembered = Remembered(*map(Tensor.view, parts, self.shapes))
-        to_goal = self.generator.relation(attractor_now, attractor_goal)
-        inputs = self.generator.gather(to_goal, embedding_now, remembered)
-        h, c = self.lstm(inputs, h, c)
-        out = self.generator.out(self.generator.head(torch.cat([h, inputs], dim=1)))  # (1, 4)
-        h, c = torch.cat([h, kept], dim=1), torch.cat([c, spare], dim=1)
-        end = self.generator.guide.seen(to_goal)
-        return out[:, :2], out[:, 2], torch.sigmoid(out[:, 3]), end, h, c
-
-    def _remember(self, first: Tensor, start: Tensor, embedding_goal: Tensor) -> Tensor:
-        """One, for known, and then all that is `Remembered`."""
-        relation = self.generator.relation(first, start)
-        parts = self.generator.remember(relation, embedding_goal)
-        return torch.cat([torch.ones_like(parts.stride), *(p.flatten(1) for p in parts)], dim=1)
-
-
-def remembered_shapes(networks: BehaviorNetworks) -> list[tuple[int, ...]]:
-    """Of the parts of what one behavior has `Remembered`."""
-    relation = torch.zeros(1, networks.config.relation)
-    with torch.no_grad():
-        parts = networks.generator.remember(relation, torch.zeros(1, signature.EMBEDDING_SIZE))
-    return [tuple(part.shape) for part in parts]
 
 
 class ShapeTick(nn.Module):
@@ -183,14 +111,13 @@ class ShapeTick(nn.Module):
 
 
 def encoder_signature(networks: BehaviorNetworks) -> signature.Graph:
-    """Tensors of the encoder: its state is the LSTM's and the path."""
-    return signature.encoder(networks.config.encoder_state + PATH)
+    """Tensors of the encoder."""
+    return signature.encoder(sum(state_sizes(networks)))
 
 
 def generator_signature(networks: BehaviorNetworks) -> signature.Graph:
-    """Tensors of the generator: its state is the LSTM's and what is remembered."""
-    remembered = 1 + sum(map(math.prod, remembered_shapes(networks)))
-    return signature.generator(networks.config.generator_state + remembered)
+    """Tensors of the generator."""
+    return signature.generator(2 * networks.config.generator_state, recalled_size(networks))
 
 
 def ticks(networks: BehaviorNetworks) -> list[tuple[signature.Graph, nn.Module]]:
@@ -198,6 +125,7 @@ def ticks(networks: BehaviorNetworks) -> list[tuple[signature.Graph, nn.Module]]
     return [
         (encoder_signature(networks), EncoderTick(networks)),
         (signature.attractor(), AttractorTick(networks)),
+        (signature.recall(recalled_size(networks)), RecallTick(networks)),
         (generator_signature(networks), GeneratorTick(networks)),
         (signature.shape(), ShapeTick()),
     ]

@@ -20,6 +20,8 @@ from cbe_training.networks import BehaviorNetworks
 from cbe_training.rollout import roll_out, show
 
 BEHAVIORS, FRAMES = 4, 40
+GRAPHS = ("encoder", "attractor", "recall", "generator", "shape")
+SAID = ("waypoint_m", "progress", "on_route", "end")
 
 Arrays = dict[str, NDArray[np.generic]]
 
@@ -60,7 +62,7 @@ def worst_difference(networks: BehaviorNetworks, folder: Path, rides: Rides) -> 
         name: onnxruntime.InferenceSession(
             str(folder / f"{name}.onnx"), providers=["CPUExecutionProvider"]
         )
-        for name in ("encoder", "attractor", "generator", "shape")
+        for name in GRAPHS
     }
     worst, ticks = 0.0, 0
     for images, frames, shown in zip(rides.images, rides.frames, rides.shown, strict=True):
@@ -110,11 +112,10 @@ def replay(
     def look(frames: NDArray[np.uint8]) -> tuple[Arrays, list[Arrays]]:
         state = _zeros(encoder_signature(networks))
         seen: list[Arrays] = []
-        for index, image in enumerate(frames):
+        for image in frames:
             state["image"] = image[None]
-            state["is_first"] = np.array([float(index == 0)], np.float32)
             out = _call(sessions["encoder"], state)
-            state |= {"previous_features": out["features"], "h": out["h_next"], "c": out["c_next"]}
+            state["state"] = out["state_next"]
             attractor = _call(sessions["attractor"], {"features": out["features"]})
             path = _call(sessions["shape"], {"embedding": out["embedding"]})
             seen.append({"embedding": out["embedding"], **attractor, **path})
@@ -122,20 +123,20 @@ def replay(
 
     goal, memory = look(shown)
     _, seen = look(images)
-    state = _zeros(generator_signature(networks))
-    state |= {
+    behavior = {
         "attractor_first": seen[0]["attractor"],
         "attractor_start": memory[0]["attractor"],
         "attractor_goal": goal["attractor"],
         "embedding_goal": goal["embedding"],
     }
+    state = _zeros(generator_signature(networks)) | _call(sessions["recall"], behavior)
     rows = []
     for now in seen:
         state |= {"attractor_now": now["attractor"], "embedding_now": now["embedding"]}
         out = _call(sessions["generator"], state)
-        state |= {"h": out["h_next"], "c": out["c_next"]}
-        parts = [out["waypoint_m"][0], out["progress"], out["on_route"], out["end"][0]]
-        rows.append(np.concatenate([*parts, now["embedding"][0], now["path_m"].reshape(-1)]))
+        state["state"] = out["state_next"]
+        parts = [*(out[name] for name in SAID), now["embedding"], now["path_m"]]
+        rows.append(np.concatenate(parts, axis=None))
     return np.stack(rows)
 
 

@@ -8,11 +8,11 @@ import onnx
 import onnxruntime
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 
-from cbe_export.parity import Arrays, Rides, replay
+from cbe_export.parity import GRAPHS, Arrays, Rides, replay
 from cbe_export.storing import restore_from_half, save
 from cbe_training.networks import BehaviorNetworks
 
-GRAPHS = ("encoder", "attractor", "generator")
+QUANTISED = ("encoder", "attractor", "generator")
 OPERATORS = ("Conv", "Gemm", "MatMul")
 """What weighs; the path that is added up and laid out is left exact."""
 
@@ -47,10 +47,10 @@ def quantise(networks: BehaviorNetworks, folder: Path, rides: Rides) -> None:
 
     Weights get a scale for each output channel, activations the range that they have in `rides`.
     """
-    sessions = {name: _Recorder(folder / f"{name}.onnx") for name in (*GRAPHS, "shape")}
+    sessions = {name: _Recorder(folder / f"{name}.onnx") for name in GRAPHS}
     for images, frames, shown in zip(rides.images, rides.frames, rides.shown, strict=True):
         replay(networks, sessions, images[:frames], shown)
-    for name in GRAPHS:
+    for name in QUANTISED:
         path = folder / f"{name}.onnx"
         model = onnx.load(path)
         metadata = {prop.key: prop.value for prop in model.metadata_props}

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from cbe_runtime.networks import Networks, Prediction
+    from cbe_runtime.networks import GeneratorState, Networks, Prediction
     from cbe_runtime.route import Route
 
 
@@ -30,7 +30,7 @@ class Behavior:
         self._start = route.attractor(segment)
         self._goal = route.attractor(segment + 1)
         self._embedding_goal = route.embedding(segment)
-        self._generator_state = networks.generator_state()
+        self._state: GeneratorState | None = None
         self._unlike_start = 0.0  # the first view from the start's, while the robot comes nearer
         self.sight: Sight | None = None  # what was seen last
         self.segment = segment
@@ -108,15 +108,14 @@ class Behavior:
         Raises:
             ModelError: an output is not finite; the state is then as before.
         """
-        state = self._networks.generator_state() if sight.begins else self._generator_state
-        prediction, self._generator_state = self._networks.generate(
-            attractor_now=sight.attractor,
-            attractor_first=sight.first,
-            attractor_start=self._start,
-            attractor_goal=self._goal,
-            embedding_now=sight.embedding,
-            embedding_goal=self._embedding_goal,
-            state=state,
-        )
+        state = self._state
+        if state is None or sight.begins:
+            state = self._networks.recall(
+                attractor_first=sight.first,
+                attractor_start=self._start,
+                attractor_goal=self._goal,
+                embedding_goal=self._embedding_goal,
+            )
+        prediction, self._state = self._networks.generate(sight.attractor, sight.embedding, state)
         self.sight = sight
         return prediction

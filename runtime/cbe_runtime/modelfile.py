@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 MAX_FILE_BYTES = 48 * 2**20
 """Far above the shipped files; a wrong file is refused before it is read."""
-MAX_STATE = 8192
+MAX_OPEN_SIZE = 1 << 18
+"""Numbers of a state; the largest of ours has 27,000."""
 MAX_SEGMENT_STEPS = 1_000_000
 
 # onnxruntime raises these, each derived from Exception alone.
@@ -70,7 +71,7 @@ class ModelFile:
                 data = file.read(MAX_FILE_BYTES + 1)
         except FileNotFoundError as error:
             raise ModelError(
-                f"no {path.name} in {path.parent}; give a folder with the three networks"
+                f"no {path.name} in {path.parent}; give a folder with a model's networks"
             ) from error
         except OSError as error:
             raise ModelError(f"cannot read {path}: {error.strerror}; check the file") from error
@@ -106,11 +107,11 @@ def open_session(file: ModelFile) -> ort.InferenceSession:
         ) from fault
 
 
-def state_size(file: ModelFile) -> int:
-    """Width of the recurrent state, the one size the signature leaves open; 0 if none is stated."""
-    shapes = [tensor.shape for tensor in file.header.inputs if tensor.name == "h"]
+def open_size(file: ModelFile, name: str) -> int:
+    """Width of an input that the signature leaves open; 0 if none is stated, or too large a one."""
+    shapes = [tensor.shape for tensor in file.header.inputs if tensor.name == name]
     width = shapes[0][-1] if shapes and shapes[0] else 0
-    return width if 0 < width <= MAX_STATE else 0
+    return width if 0 < width <= MAX_OPEN_SIZE else 0
 
 
 def check_graph(file: ModelFile, graph: signature.Graph) -> None:

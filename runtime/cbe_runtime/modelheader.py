@@ -19,15 +19,14 @@ _KNOWN = """
     Abs Add And Atan AveragePool BatchNormalization Cast Ceil Clip Concat Constant Conv
     ConvInteger Cos CumSum DequantizeLinear Div DynamicQuantizeLinear Elu Equal Erf Exp Flatten
     Floor GRU Gather Gelu Gemm GlobalAveragePool Greater GreaterOrEqual HardSigmoid HardSwish
-    Identity If InstanceNormalization LSTM LayerNormalization LeakyRelu Less LessOrEqual Log
+    Identity InstanceNormalization LSTM LayerNormalization LeakyRelu Less LessOrEqual Log
     LogSoftmax MatMul MatMulInteger Max MaxPool Min Mul Neg Not Or PRelu Pow QLinearConv
     QLinearMatMul QuantizeLinear Reciprocal ReduceL2 ReduceMax ReduceMean ReduceMin ReduceSum
     Relu Reshape Round Shape Sigmoid Sign Sin Slice Softmax Softplus Split Sqrt Squeeze Sub Tanh
     Transpose Unsqueeze Where
 """
 OPERATORS = frozenset(_KNOWN.split())
-"""What a network of ours may be built of: no loops, nothing that fills memory."""
-_BRANCHING = "If"
+"""What a network of ours may be built of: no loops or choices, nothing that fills memory."""
 
 _ELEMENTS = {1: "tensor(float)", 2: "tensor(uint8)"}
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # protobuf's wire types
@@ -60,14 +59,14 @@ def parse(data: bytes) -> Header:
 
     Raises:
         ModelError: the bytes are no ONNX, or hold what no model of ours does: functions,
-            graphs within graphs but for a choice of two, data in other files, other operators.
+            graphs within graphs, data in other files, other operators.
     """
     reader = _Reader()
     model = reader.message(memoryview(data))
     if model.of(_MODEL_FUNCTIONS) or model.of(_MODEL_TRAINING):
         raise _refusal("it holds functions or training graphs")
     graph = reader.message(model.one(_MODEL_GRAPH))
-    _check_graph(reader, graph, branch=False)
+    _check_graph(reader, graph)
     entries = [reader.message(entry) for entry in model.of(_MODEL_METADATA)]
     metadata = {entry.text(_ENTRY_KEY): entry.text(_ENTRY_VALUE) for entry in entries}
     if len(metadata) != len(entries):
@@ -79,8 +78,8 @@ def parse(data: bytes) -> Header:
     )
 
 
-def _check_graph(reader: _Reader, graph: _Message, *, branch: bool) -> None:
-    """Refuse what no model of ours holds; a branch of a choice holds no other choice."""
+def _check_graph(reader: _Reader, graph: _Message) -> None:
+    """Refuse what no model of ours holds."""
     for node in map(reader.message, graph.of(_GRAPH_NODE)):
         operator = node.text(_NODE_OPERATOR)
         if operator not in OPERATORS:
@@ -88,11 +87,8 @@ def _check_graph(reader: _Reader, graph: _Message, *, branch: bool) -> None:
                 f"it has an operator {operator[:40]!r}; known: {', '.join(sorted(OPERATORS))}"
             )
         for attribute in map(reader.message, node.of(_NODE_ATTRIBUTE)):
-            graphs = attribute.of(_ATTRIBUTE_GRAPH)
-            if attribute.of(_ATTRIBUTE_GRAPHS) or (graphs and (branch or operator != _BRANCHING)):
+            if attribute.of(_ATTRIBUTE_GRAPH) or attribute.of(_ATTRIBUTE_GRAPHS):
                 raise _refusal(f"its {operator} holds a graph of its own")
-            for inner in graphs:
-                _check_graph(reader, reader.message(inner), branch=True)
             for tensor in attribute.of(_ATTRIBUTE_TENSOR):
                 _check_weights(reader.message(tensor))
     if graph.of(_GRAPH_SPARSE):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import onnxruntime as ort
@@ -16,8 +16,8 @@ from cbe_runtime.modelfile import (
     ModelFile,
     check_graph,
     open_session,
+    open_size,
     read_metadata,
-    state_size,
 )
 from cbe_runtime.pathshape import PathShape
 
@@ -27,29 +27,18 @@ if TYPE_CHECKING:
     from cbe.camera import CameraModel
     from cbe_runtime.modelfile import Metadata
 
+GRAPHS = ("encoder", "attractor", "recall", "generator")
 PACKAGED_MODELS = Path(__file__).parent / "models"
 
 
-@dataclass(frozen=True, slots=True)
-class EncoderState:
-    """What the encoder carries from one network frame to the next.
+class GeneratorState(NamedTuple):
+    """What the waypoint generator carries through one behavior, both (size,) float32.
 
-    `features` (1, *FEATURES), `h` and `c` (1, state) float32; `is_first` (1,) is 1 until the
-    behavior's first frame has been seen.
+    `recalled` is worked out once, `recurrent` changes each tick.
     """
 
-    features: NDArray[np.float32]
-    is_first: NDArray[np.float32]
-    h: NDArray[np.float32]
-    c: NDArray[np.float32]
-
-
-@dataclass(frozen=True, slots=True)
-class GeneratorState:
-    """The waypoint generator's recurrent state: `h` and `c` (1, state) float32."""
-
-    h: NDArray[np.float32]
-    c: NDArray[np.float32]
+    recalled: NDArray[np.float32]
+    recurrent: NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,68 +58,55 @@ class Prediction:
 
 
 class Networks:
-    """Encoder, attractor and generator of one model, one thread each, checked before use."""
+    """Encoder, attractor and generator of one model, one thread each, checked before use.
+
+    The generator is two graphs: `recall` runs once a behavior, `generator` each tick.
+    """
 
     def __init__(
         self,
-        encoder: ort.InferenceSession,
-        attractor: ort.InferenceSession,
-        generator: ort.InferenceSession,
+        sessions: dict[str, ort.InferenceSession],
         metadata: Metadata,
         shape: PathShape | None = None,
     ) -> None:
-        self._encoder = encoder = Graph(encoder, "encoder")
-        self._attractor = Graph(attractor, "attractor")
-        self._generator = generator = Graph(generator, "generator")
+        graphs = [Graph(sessions[name], name) for name in GRAPHS]
+        self._encoder, self._attractor, self._recall, self._generator = graphs
         self._metadata = metadata
         self._shape = shape
-        self._first_state = EncoderState(
-            encoder.zeros("previous_features"),
-            np.ones(1, np.float32),
-            encoder.zeros("h"),
-            encoder.zeros("c"),
-        )
-        self._first_generator_state = GeneratorState(generator.zeros("h"), generator.zeros("c"))
-        self._not_first = np.zeros(1, np.float32)
+        self._encoder_zeros = self._encoder.zeros("state")
+        self._generator_zeros = self._generator.zeros("state")
 
     @classmethod
     def load(cls, folder: Path = PACKAGED_MODELS) -> Networks:
-        """Open `encoder.onnx`, `attractor.onnx` and `generator.onnx` of `folder`.
+        """Open the file of each of `GRAPHS` in `folder`, and `shape.onnx` where there is one.
 
-        All is checked before anything is built. `shape.onnx` is opened where there is one.
+        All is checked before anything is built.
 
         Raises:
             ModelError: a file is missing, too large or no ONNX; names, shapes or types differ
                 from `cbe.signature`; metadata is missing; or they are of different models.
         """
-        files = [
-            ModelFile.read(folder / f"{name}.onnx")
-            for name in ("encoder", "attractor", "generator")
-        ]
-        encoder, attractor, generator = files
-        check_graph(encoder, signature.encoder(state_size(encoder)))
-        check_graph(attractor, signature.attractor())
-        check_graph(generator, signature.generator(state_size(generator)))
-        parsed = [read_metadata(file) for file in files]
-        if any(other != parsed[0] for other in parsed):
-            ids = ", ".join(each.model_id for each in parsed)
+        files = {name: ModelFile.read(folder / f"{name}.onnx") for name in GRAPHS}
+        generator = files["generator"]
+        recalled = open_size(generator, "recalled")
+        check_graph(files["encoder"], signature.encoder(open_size(files["encoder"], "state")))
+        check_graph(files["attractor"], signature.attractor())
+        check_graph(files["recall"], signature.recall(recalled))
+        check_graph(generator, signature.generator(open_size(generator, "state"), recalled))
+        metadata, *others = [read_metadata(file) for file in files.values()]
+        if any(other != metadata for other in others):
+            ids = ", ".join(each.model_id for each in (metadata, *others))
             raise ModelError(
-                f"the encoder, attractor and generator in {folder} are of different models "
-                f"({ids}); export all three from one checkpoint"
+                f"the networks in {folder} are of different models ({ids}); export all from one "
+                "checkpoint"
             )
         shape = PathShape.load(folder) if PathShape.there(folder) else None
-        if shape is not None and shape.model_id != parsed[0].model_id:
+        if shape is not None and shape.model_id != metadata.model_id:
             raise ModelError(
                 f"in {folder} shape.onnx is of model {shape.model_id}, the others are of "
-                f"{parsed[0].model_id}; export all from one checkpoint, or delete shape.onnx"
+                f"{metadata.model_id}; export all from one checkpoint, or delete shape.onnx"
             )
-        return cls(
-            open_session(encoder),
-            open_session(attractor),
-            open_session(generator),
-            parsed[0],
-            shape,
-        )
+        return cls({name: open_session(file) for name, file in files.items()}, metadata, shape)
 
     @property
     def model_id(self) -> str:
@@ -157,49 +133,38 @@ class Networks:
         """`fp32` or `int8`."""
         return self._metadata.precision
 
-    def encoder_state(self) -> EncoderState:
-        """The state before a behavior's first frame."""
-        return self._first_state
-
-    def generator_state(self) -> GeneratorState:
-        """The state before a behavior's first tick."""
-        return self._first_generator_state
+    def encoder_state(self) -> NDArray[np.float32]:
+        """The state (size,) before a behavior's first frame."""
+        return self._encoder_zeros
 
     def encode(
-        self, image: NDArray[np.uint8], state: EncoderState
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], EncoderState]:
+        self, image: NDArray[np.uint8], state: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """See one frame.
 
         Args:
             image: (64, 64, 3) uint8 RGB, the model's view.
-            state: of the previous network frame, or `encoder_state()` on a behavior's first.
+            state: (size,) of the previous network frame, or `encoder_state()` on a behavior's
+                first.
 
         Returns:
-            features (1, *FEATURES), embedding z (32,) of the frames since the first, next state.
+            features (*FEATURES), embedding z (32,) of the frames since the first, next state.
 
         Raises:
             ModelError: an output is not finite.
         """
-        features, embedding, h, c = self._encoder.run(
-            {
-                "image": image[None],  # (1, 64, 64, 3)
-                "previous_features": state.features,
-                "is_first": state.is_first,
-                "h": state.h,
-                "c": state.c,
-            },
-        )
-        return features, embedding.reshape(-1), EncoderState(features, self._not_first, h, c)
+        features, embedding, state = self._encoder.run(image, state)
+        return features, embedding, state
 
     def attract(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Attractor (400,) of the frame whose features (1, *FEATURES) these are.
+        """Attractor (400,) of the frame whose features (*FEATURES) these are.
 
         Raises:
             ModelError: an output is not finite.
         """
         attractor: NDArray[np.float32]
-        (attractor,) = self._attractor.run({"features": features})
-        return attractor.reshape(-1)  # (1, 400) to (400,)
+        (attractor,) = self._attractor.run(features)
+        return attractor
 
     def path_m(self, embedding: NDArray[np.float32]) -> NDArray[np.float64] | None:
         """Points (8, 2) as `PathShape.read`, or None if the model does not tell.
@@ -209,41 +174,45 @@ class Networks:
         """
         return None if self._shape is None else self._shape.read(embedding)
 
-    def generate(
+    def recall(
         self,
         *,
-        attractor_now: NDArray[np.float32],
         attractor_first: NDArray[np.float32],
         attractor_start: NDArray[np.float32],
         attractor_goal: NDArray[np.float32],
-        embedding_now: NDArray[np.float32],
         embedding_goal: NDArray[np.float32],
-        state: GeneratorState,
-    ) -> tuple[Prediction, GeneratorState]:
-        """Where to go next on the behavior from `attractor_start` to `attractor_goal`.
+    ) -> GeneratorState:
+        """The state before the first tick of the behavior from `attractor_start` to `_goal`.
 
-        Attractors are (400,) float32: now, at the repetition's first frame of this behavior,
-        and the demonstration's two; embeddings are (32,).
+        Attractors (400,) float32 are those of the repetition's first frame of this behavior and of
+        the demonstration's two; the embedding is (32,).
 
         Raises:
             ModelError: an output is not finite.
         """
-        waypoint_m, progress, on_route, end, h, c = self._generator.run(
-            {
-                "attractor_now": attractor_now[None],
-                "attractor_first": attractor_first[None],
-                "attractor_start": attractor_start[None],
-                "attractor_goal": attractor_goal[None],
-                "embedding_now": embedding_now[None],
-                "embedding_goal": embedding_goal[None],
-                "h": state.h,
-                "c": state.c,
-            },
+        (recalled,) = self._recall.run(
+            attractor_first, attractor_start, attractor_goal, embedding_goal
+        )
+        return GeneratorState(recalled, self._generator_zeros)
+
+    def generate(
+        self,
+        attractor: NDArray[np.float32],
+        embedding: NDArray[np.float32],
+        state: GeneratorState,
+    ) -> tuple[Prediction, GeneratorState]:
+        """Where to go next, from this frame's attractor (400,) and embedding (32,).
+
+        Raises:
+            ModelError: an output is not finite.
+        """
+        waypoint_m, progress, on_route, end, recurrent = self._generator.run(
+            state.recalled, attractor, embedding, state.recurrent
         )
         prediction = Prediction(
-            waypoint_m[0].astype(np.float64),
-            float(progress[0]),
-            float(on_route[0]),
-            end[0].astype(np.float64),
+            waypoint_m.astype(np.float64),
+            progress.item(),
+            on_route.item(),
+            end.astype(np.float64),
         )
-        return prediction, GeneratorState(h, c)
+        return prediction, GeneratorState(state.recalled, recurrent)

@@ -90,8 +90,7 @@ def add_model(parser: argparse.ArgumentParser) -> None:
         type=Path,
         default=PACKAGED_MODELS,
         metavar="DIR",
-        help="folder with encoder.onnx, attractor.onnx and generator.onnx (default: the shipped "
-        "model)",
+        help="folder with a model's ONNX files (default: the shipped model)",
     )
 
 

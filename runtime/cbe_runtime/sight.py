@@ -9,17 +9,20 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from cbe_runtime.networks import EncoderState, Networks
+    from cbe_runtime.networks import Networks
 
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """After a frame: attractors (400,) of it and of the first, embedding z (32,) since then."""
+    """After a frame: attractors (400,) of it and of the first, embedding z (32,) since then.
+
+    `state` (size,) float32 is what the encoder carries on.
+    """
 
     attractor: NDArray[np.float32]
     first: NDArray[np.float32]
     embedding: NDArray[np.float32]
-    state: EncoderState
+    state: NDArray[np.float32]
 
     @property
     def begins(self) -> bool:

@@ -28,9 +28,6 @@ class Counting:
     def encoder_state(self):
         return None
 
-    def generator_state(self):
-        return 0
-
     def encode(self, image, state):
         return np.zeros((1, 1), np.float32), np.ones(EMBEDDING_SIZE, np.float32), None
 
@@ -40,9 +37,11 @@ class Counting:
     def path_m(self, embedding):
         return None
 
-    def generate(self, *, state, attractor_start, attractor_goal, **others):
-        if state == 0:
-            self.given.append((bool(attractor_start.any()), bool(attractor_goal.any())))
+    def recall(self, *, attractor_start, attractor_goal, **others):
+        self.given.append((bool(attractor_start.any()), bool(attractor_goal.any())))
+        return 0
+
+    def generate(self, attractor, embedding, state):
         progress = 1.0 if state >= self.ticks else 0.0
         end = np.array([0.2 * max(self.ticks - state, 0), 0.0, 1.0, 0.0])
         return Prediction(np.array([0.3, 0.0]), progress, self.on_route, end), state + 1

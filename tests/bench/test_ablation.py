@@ -36,22 +36,25 @@ class NeedsItsMemory:
     def encoder_state(self):
         return None
 
-    def generator_state(self):
-        return 0
-
     def encode(self, image, state):
         return np.zeros((1, 1), np.float32), np.full(EMBEDDING_SIZE, LAST, np.float32), None
 
     def attract(self, features):
         return np.ones(ATTRACTOR_SIZE, np.float32)
 
-    def generate(self, *, state, attractor_start, attractor_goal, embedding_goal, **now):
+    def recall(self, *, attractor_start, attractor_goal, embedding_goal, **now):
         assert np.all(embedding_goal == LAST) or not embedding_goal.any()
-        assert all(np.all(each != 0.0) for each in (now["attractor_now"], now["embedding_now"]))
         lost = self.stubborn or not (attractor_start.any() and attractor_goal.any())
-        progress = 0.0 if lost else state / 3.0
+        return lost, 0
+
+    def generate(self, attractor, embedding, state):
+        assert np.all(attractor != 0.0)
+        assert np.all(embedding != 0.0)
+        lost, ticks = state
+        progress = 0.0 if lost else ticks / 3.0
         end = np.array([0.3 * (1.0 - progress), 0.0, 1.0, 0.0])
-        return Prediction(np.array([end[0] + OVERRUN_M, 0.0]), progress, 1.0, end), state + 1
+        waypoint_m = np.array([end[0] + OVERRUN_M, 0.0])
+        return Prediction(waypoint_m, progress, 1.0, end), (lost, ticks + 1)
 
 
 @pytest.fixture(autouse=True)

@@ -74,16 +74,16 @@ class StraightOn:
     def encoder_state(self):
         return None
 
-    def generator_state(self):
-        return 0
-
     def encode(self, image, state):
         return np.zeros((1, 1), np.float32), np.zeros(32, np.float32), None
 
     def attract(self, features):
         return np.full(400, 0.5, np.float32)
 
-    def generate(self, *, state, **memory):
+    def recall(self, **memory):
+        return 0
+
+    def generate(self, attractor, embedding, state):
         progress = self._progress(state)
         end = np.array([(1.0 - progress) * LENGTH_M, 0.0, 1.0, 0.0])
         ahead = np.array([min(0.5, end[0] + OVERRUN_M), 0.0])

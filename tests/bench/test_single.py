@@ -28,9 +28,6 @@ class StraightOn:
     def encoder_state(self):
         return None
 
-    def generator_state(self):
-        return 0
-
     def encode(self, image, state):
         assert image.shape == (64, 64, 3)
         return np.zeros((1, 1), np.float32), np.zeros(32, np.float32), None
@@ -38,7 +35,10 @@ class StraightOn:
     def attract(self, features):
         return np.zeros(400, np.float32)
 
-    def generate(self, *, state, **memory):
+    def recall(self, **memory):
+        return 0
+
+    def generate(self, attractor, embedding, state):
         end, ahead = np.array([0.2, 0.0, 1.0, 0.0]), np.array([0.2 + OVERRUN_M, 0.0])
         return Prediction(ahead, 0.1 * state, 1.0, end), state + 1
 

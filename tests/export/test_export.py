@@ -12,7 +12,7 @@ from cbe import signature
 from cbe.errors import ModelError
 from cbe_export import export as export_module
 from cbe_export.export import identify, write_graphs
-from cbe_export.parity import Rides, worst_difference
+from cbe_export.parity import GRAPHS, Rides, worst_difference
 from cbe_export.quantise import quantise
 from cbe_export.storing import restore_from_half, store_in_half
 from cbe_runtime.networks import Networks
@@ -49,7 +49,7 @@ def test_runtime_loads_what_was_exported(folder: Path) -> None:
 
 
 def test_every_graph_carries_all_metadata(folder: Path) -> None:
-    for name in ("encoder", "attractor", "generator", "shape"):
+    for name in GRAPHS:
         model = onnx.load(folder / f"{name}.onnx")
         assert {p.key for p in model.metadata_props} >= set(signature.METADATA_KEYS)
 

@@ -1,4 +1,4 @@
-"""Model folders: three ONNX files each."""
+"""Model folders: an ONNX file for each network."""
 
 import json
 from pathlib import Path
@@ -13,13 +13,12 @@ from cbe.camera import MODEL_CAMERA
 from cbe.errors import ModelError
 from cbe_runtime import modelheader
 from cbe_runtime.modelfile import MAX_FILE_BYTES
-from cbe_runtime.networks import Networks
+from cbe_runtime.networks import GRAPHS, Networks
 
 from .harness import SEED
 from .mutate import mutants
 
 SHIPPED = Path(modelheader.__file__).parent / "models"
-NAMES = ("encoder", "attractor", "generator")
 METADATA = {
     "cbe.contract_version": str(signature.CONTRACT_VERSION),
     "cbe.model_id": "00112233445566aa",
@@ -96,7 +95,7 @@ def attacks(metadata):
 
 @pytest.fixture
 def folder(tmp_path):
-    for name in NAMES:
+    for name in GRAPHS:
         (tmp_path / f"{name}.onnx").write_bytes((SHIPPED / f"{name}.onnx").read_bytes())
     return tmp_path
 
@@ -119,7 +118,7 @@ def test_hostile_model_is_refused_soon_and_small(fuzzed, folder):
     """The attractor of a folder; whatever is accepted must also run, or say why not."""
     path = folder / "attractor.onnx"
     whole = onnx.load(path)
-    features = np.zeros((1, *signature.FEATURES), np.float32)
+    features = np.zeros(signature.FEATURES, np.float32)
 
     def read(data):
         path.write_bytes(data)
@@ -133,7 +132,7 @@ def test_hostile_model_is_refused_soon_and_small(fuzzed, folder):
     assert 0 < report.accepted < report.inputs
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", GRAPHS)
 def test_truncated_model_is_refused(folder, name):
     path = folder / f"{name}.onnx"
     whole = path.read_bytes()
@@ -144,7 +143,7 @@ def test_truncated_model_is_refused(folder, name):
 
 
 def test_folder_in_a_files_place_is_refused(folder):
-    for name in reversed(NAMES):
+    for name in reversed(GRAPHS):
         path = folder / f"{name}.onnx"
         path.unlink()
         path.mkdir()

@@ -53,7 +53,6 @@ def write(folder, graph, nodes, weights, **metadata):
 def encoder_nodes(rng):
     """Features are a pooled image; the state counts frames; z is the mean of the image."""
     weights = {
-        "axes": np.array([1, 2, 3], np.int64),
         "scale": np.float32([1 / 255]),
         "one": np.float32([1.0]),
         "spread": rng.normal(size=(signature.FEATURES[0], 3, 1, 1)).astype(np.float32),
@@ -65,16 +64,9 @@ def encoder_nodes(rng):
         helper.make_node("Transpose", ["unit"], ["nchw"], perm=[0, 3, 1, 2]),
         helper.make_node("AveragePool", ["nchw"], ["pooled"], kernel_shape=[4, 4], strides=[4, 4]),
         helper.make_node("Conv", ["pooled", "spread"], ["features"]),
-        helper.make_node("ReduceMean", ["previous_features"], ["past"], axes=[1, 2, 3], keepdims=0),
-        helper.make_node("ReduceMean", ["features"], ["present"], axes=[1, 2, 3], keepdims=0),
-        helper.make_node("Sub", ["one", "is_first"], ["again"]),
-        helper.make_node("Mul", ["h", "again"], ["kept"]),
-        helper.make_node("Add", ["kept", "one"], ["h_next"]),
-        helper.make_node("Add", ["past", "present"], ["both"]),
-        helper.make_node("Add", ["c", "both"], ["c_next"]),
-        helper.make_node("MatMul", ["h_next", "to_z"], ["embedding"]),
+        helper.make_node("Add", ["state", "one"], ["state_next"]),
+        helper.make_node("MatMul", ["state_next", "to_z"], ["embedding"]),
     ]
-    weights.pop("axes")
     return nodes, weights
 
 
@@ -90,6 +82,19 @@ def attractor_nodes(rng):
     return nodes, weights
 
 
+def recall_nodes():
+    """What is recalled is the behavior's embedding."""
+    graph = signature.recall(signature.EMBEDDING_SIZE)
+    attractors = [t.name for t in graph.inputs[:3]]
+    nodes = [
+        helper.make_node("Concat", attractors, ["all"], axis=1),
+        helper.make_node("ReduceMean", ["all"], ["used"], axes=[1]),
+        helper.make_node("Mul", ["used", "zero"], ["nothing"]),
+        helper.make_node("Add", ["embedding_goal", "nothing"], ["recalled"]),
+    ]
+    return graph, nodes, {"zero": np.float32([0.0])}
+
+
 def generator_nodes(ticks_to_goal, waypoint_m):
     """Progress counts ticks since the behavior began; the waypoint is always straight ahead.
 
@@ -102,20 +107,18 @@ def generator_nodes(ticks_to_goal, waypoint_m):
         "end_pose": np.float32([[0.0, waypoint_m[1], 1.0, 0.0]]),
         "left": np.float32([[4.0, 0.0, 0.0, 0.0]]),
         "zero": np.float32([0.0]),
-        "flat": np.array([1], np.int64),
         "sure": np.float32([5.0]),
     }
-    inputs = [t.name for t in signature.generator(STATE).inputs[:6]]
+    graph = signature.generator(STATE, signature.EMBEDDING_SIZE)
+    inputs = [t.name for t in graph.inputs[:3]]
     nodes = [
-        helper.make_node("Add", ["h", "one"], ["h_next"]),
-        helper.make_node("Identity", ["c"], ["c_next"]),
-        helper.make_node("MatMul", ["h_next", "rate"], ["share"]),
-        helper.make_node("Reshape", ["share", "flat"], ["progress"]),
+        helper.make_node("Add", ["state", "one"], ["state_next"]),
+        helper.make_node("MatMul", ["state_next", "rate"], ["progress"]),
         helper.make_node("Concat", inputs, ["all"], axis=1),
-        helper.make_node("ReduceMean", ["all"], ["used"], axes=[1], keepdims=0),
+        helper.make_node("ReduceMean", ["all"], ["used"], axes=[1]),
         helper.make_node("Mul", ["used", "zero"], ["nothing"]),
         helper.make_node("Add", ["ahead", "nothing"], ["waypoint_m"]),
-        helper.make_node("Sub", ["one", "share"], ["undone"]),
+        helper.make_node("Sub", ["one", "progress"], ["undone"]),
         helper.make_node("Relu", ["undone"], ["still_undone"]),
         helper.make_node("Mul", ["still_undone", "left"], ["farther"]),
         helper.make_node("Add", ["end_pose", "farther"], ["farther_end"]),
@@ -123,7 +126,7 @@ def generator_nodes(ticks_to_goal, waypoint_m):
         helper.make_node("Add", ["nothing", "sure"], ["on_route_logit"]),
         helper.make_node("Sigmoid", ["on_route_logit"], ["on_route"]),
     ]
-    return nodes, weights
+    return graph, nodes, weights
 
 
 def make_model(folder, ticks_to_goal=19.5, waypoint_m=(0.5, 0.0), **metadata):
@@ -132,9 +135,8 @@ def make_model(folder, ticks_to_goal=19.5, waypoint_m=(0.5, 0.0), **metadata):
     folder.mkdir(parents=True, exist_ok=True)
     write(folder, signature.encoder(STATE), *encoder_nodes(rng), **metadata)
     write(folder, signature.attractor(), *attractor_nodes(rng), **metadata)
-    write(
-        folder, signature.generator(STATE), *generator_nodes(ticks_to_goal, waypoint_m), **metadata
-    )
+    write(folder, *recall_nodes(), **metadata)
+    write(folder, *generator_nodes(ticks_to_goal, waypoint_m), **metadata)
     return folder
 
 

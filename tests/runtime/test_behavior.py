@@ -21,16 +21,16 @@ class GreyNetworks:
     def encoder_state(self):
         return 0
 
-    def generator_state(self):
-        return 0
-
     def encode(self, image, state):
         return image[0, 0, 0] / 255.0, np.zeros(signature.EMBEDDING_SIZE, np.float32), state + 1
 
     def attract(self, features):
         return np.full(signature.ATTRACTOR_SIZE, features, np.float32)
 
-    def generate(self, *, state, **_):
+    def recall(self, **_):
+        return 0
+
+    def generate(self, attractor, embedding, state):
         return state + 1, state + 1
 
 

@@ -97,15 +97,15 @@ def test_segment_switches_at_its_progress_and_resets_every_state(drive):
     decision = drive.step(2)
     assert decision.ticked
     assert decision.progress == pytest.approx(1 / 19.5)
-    assert drive.follower._behavior.sight.state.h[0, 0] == 1
+    assert drive.follower._behavior.sight.state[0] == 1
 
 
 def test_single_tick_of_high_progress_does_not_switch(drive, monkeypatch):
     drive.step(4)
     generate = Networks.generate
 
-    def spike(self, **inputs):
-        prediction, state = generate(self, **inputs)
+    def spike(self, *inputs):
+        prediction, state = generate(self, *inputs)
         return replace(prediction, progress=1.0), state
 
     with monkeypatch.context() as patch:
@@ -126,8 +126,8 @@ def _saying(drive, monkeypatch, segment=1, **said):
     drive.follower._begin(segment)
     generate = Networks.generate
 
-    def fixed(self, **inputs):
-        prediction, state = generate(self, **inputs)
+    def fixed(self, *inputs):
+        prediction, state = generate(self, *inputs)
         return replace(prediction, **said), state
 
     monkeypatch.setattr(Networks, "generate", fixed)
@@ -396,7 +396,7 @@ def test_wall_ahead_keeps_the_robot_from_driving(drive):
 def test_model_fault_stops_until_the_next_start(drive, monkeypatch):
     drive.step(4)
 
-    def broken(*_arguments, **_inputs):
+    def broken(*_inputs):
         raise ModelError("not finite")
 
     with monkeypatch.context() as patch:

@@ -53,8 +53,8 @@ def says(monkeypatch):
     said = {"on_route": SURE, "progress": 0.4}
     generate = Networks.generate
 
-    def saying(self, **inputs):
-        prediction, state = generate(self, **inputs)
+    def saying(self, *inputs):
+        prediction, state = generate(self, *inputs)
         return replace(prediction, **said), state
 
     monkeypatch.setattr(Networks, "generate", saying)

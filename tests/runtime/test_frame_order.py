@@ -53,7 +53,7 @@ def drive(networks, route):
 
 def fed(drive):
     """How many frames the encoder has counted."""
-    return int(drive.follower._behavior.sight.state.h[0, 0])
+    return int(drive.follower._behavior.sight.state[0])
 
 
 def test_frame_that_was_overtaken_is_never_fed(drive):

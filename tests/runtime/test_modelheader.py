@@ -43,30 +43,6 @@ def subgraph(model):
     model.graph.node[0].attribute.append(attribute)
 
 
-def choice(model, *nodes):
-    """A choice between two graphs of these nodes."""
-    branch = helper.make_graph(list(nodes), "branch", [], [])
-    model.graph.node.append(
-        helper.make_node("If", ["x"], ["y"], then_branch=branch, else_branch=branch)
-    )
-
-
-def loop_in_a_choice(model):
-    choice(model, helper.make_node("Identity", ["x"], ["y"]), helper.make_node("Loop", [], ["y"]))
-
-
-def choice_in_a_choice(model):
-    choice(model)
-    inner = model.graph.node.pop()
-    choice(model, inner)
-
-
-def other_file_in_a_choice(model):
-    choice(model)
-    weights = model.graph.node[-1].attribute[0].g.initializer.add()
-    weights.data_location = TensorProto.EXTERNAL
-
-
 def function(model):
     model.functions.add().name = "f"
 
@@ -87,9 +63,6 @@ def same_key(model):
         (loop, "operator 'Loop'"),
         (memory, "operator 'ConstantOfShape'"),
         (subgraph, "graph of its own"),
-        (loop_in_a_choice, "operator 'Loop'"),
-        (choice_in_a_choice, "graph of its own"),
-        (other_file_in_a_choice, "another file"),
         (function, "functions"),
         (sparse, "sparse"),
         (same_key, "twice"),
@@ -100,11 +73,6 @@ def test_what_no_model_of_ours_holds_is_refused(model, change, reason):
     change(model)
     with pytest.raises(ModelError, match=reason):
         modelheader.parse(model.SerializeToString())
-
-
-def test_a_choice_of_two_known_graphs_is_let_pass(model):
-    choice(model, helper.make_node("Identity", ["x"], ["y"]))
-    modelheader.parse(model.SerializeToString())
 
 
 def test_two_graphs_that_readers_would_merge_are_refused(model):

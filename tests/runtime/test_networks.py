@@ -10,18 +10,21 @@ from cbe_runtime.networks import Networks
 IMAGE = np.full((64, 64, 3), 100, np.uint8)
 
 
-def tick(networks, encoder_state, generator_state, image=IMAGE):
-    features, embedding, encoder_state = networks.encode(image, encoder_state)
+def recall(networks):
+    features, embedding, _ = networks.encode(IMAGE, networks.encoder_state())
     attractor = networks.attract(features)
-    prediction, generator_state = networks.generate(
-        attractor_now=attractor,
+    return networks.recall(
         attractor_first=attractor,
         attractor_start=attractor,
         attractor_goal=attractor,
-        embedding_now=embedding,
         embedding_goal=embedding,
-        state=generator_state,
     )
+
+
+def tick(networks, encoder_state, generator_state):
+    features, embedding, encoder_state = networks.encode(IMAGE, encoder_state)
+    attractor = networks.attract(features)
+    prediction, generator_state = networks.generate(attractor, embedding, generator_state)
     return prediction, encoder_state, generator_state
 
 
@@ -33,22 +36,21 @@ def test_metadata_is_read(networks):
 
 
 def test_state_is_carried_from_tick_to_tick(networks):
-    encoder_state, generator_state = networks.encoder_state(), networks.generator_state()
+    encoder_state, generator_state = networks.encoder_state(), recall(networks)
     progress = []
     for _ in range(3):
         prediction, encoder_state, generator_state = tick(networks, encoder_state, generator_state)
         progress.append(prediction.progress)
     np.testing.assert_allclose(progress, np.array([1, 2, 3]) / 19.5, rtol=1e-5)
-    assert encoder_state.is_first[0] == 0
-    assert encoder_state.h[0, 0] == 3
+    assert encoder_state[0] == generator_state.recurrent[0] == 3
     # The initial states are shared; running must not have changed them.
-    assert networks.encoder_state().is_first[0] == 1
-    assert not networks.generator_state().h.any()
+    assert not networks.encoder_state().any()
+    assert not recall(networks).recurrent.any()
 
 
 def test_shapes_are_those_promised(networks):
     features, embedding, _ = networks.encode(IMAGE, networks.encoder_state())
-    assert features.shape == (1, *FEATURES)
+    assert features.shape == FEATURES
     assert embedding.shape == (32,)
     attractor = networks.attract(features)
     assert attractor.shape == (400,)
@@ -57,8 +59,8 @@ def test_shapes_are_those_promised(networks):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_output_that_is_not_finite_is_a_model_error(networks, value):
-    features = np.full((1, *FEATURES), value, np.float32)
-    features[0, ::2] = -features[0, ::2]
+    features = np.full(FEATURES, value, np.float32)
+    features[::2] = -features[::2]
     with pytest.raises(ModelError, match="not finite"):
         networks.attract(features)
 
@@ -93,7 +95,7 @@ def test_oversized_file_is_refused_before_it_is_parsed(tmp_path, model_writer):
 def test_graph_in_another_ones_place_is_refused_with_its_tensors(tmp_path, model_writer):
     folder = model_writer(tmp_path / "m")
     (folder / "attractor.onnx").write_bytes((folder / "encoder.onnx").read_bytes())
-    with pytest.raises(ModelError, match="previous_features"):
+    with pytest.raises(ModelError, match="image"):
         Networks.load(folder)
 
 

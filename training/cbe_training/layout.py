@@ -44,12 +44,12 @@ def length_m(embedding: Tensor) -> Tensor:
 
 def frame(pose: Tensor) -> Tensor:
     """Matrices (..., 3, 3) of poses (..., 4: x, y, cos, sin)."""
-    return F.linear(pose, _FRAME[0].to(pose), _FRAME[1].to(pose)).unflatten(-1, (3, 3))
+    return F.linear(pose, FRAME[0].to(pose), FRAME[1].to(pose)).unflatten(-1, (3, 3))
 
 
 def into(embedding: Tensor) -> Tensor:
     """Matrices (..., 3, 3) that bring points of the first frame into that of the path's end."""
-    return _read(embedding, _TURN_BACK, 3) @ _read(embedding, _MOVE_BACK, 3)
+    return _read(embedding, TURN_BACK, 3) @ _read(embedding, MOVE_BACK, 3)
 
 
 def from_start(embedding: Tensor) -> Tensor:
@@ -60,7 +60,7 @@ def from_start(embedding: Tensor) -> Tensor:
 def from_end(embedding: Tensor) -> Tensor:
     """The path's columns (..., 3, 18) in the frame of its end."""
     columns = _read(embedding, _COLUMNS_FROM_END, PATH_POINTS + 2)
-    return _read(embedding, _TURN_BACK, 3) @ columns
+    return _read(embedding, TURN_BACK, 3) @ columns
 
 
 def _read(embedding: Tensor, matrix: tuple[Tensor, Tensor], columns: int) -> Tensor:
@@ -115,15 +115,16 @@ def _legs() -> Tensor:
 
 
 _ROTATION: _Entries = {(0, 0): {_COS: 1.0}, (1, 1): {_COS: 1.0}, (2, 2): {None: 1.0}}
-_FRAME = _matrix(
+# Weights and bias that read the matrices off a pose (FRAME) and off z.
+FRAME = _matrix(
     {**_ROTATION, (0, 1): {_SIN: -1.0}, (1, 0): {_SIN: 1.0}, (0, 2): {_X: 1.0}, (1, 2): {_Y: 1.0}},
     3,
     PLACE,
 )
-_TURN_BACK = _matrix(
+TURN_BACK = _matrix(
     {**_ROTATION, (0, 1): {_SIN: 1.0}, (1, 0): {_SIN: -1.0}}, 3, signature.EMBEDDING_SIZE
 )
-_MOVE_BACK = _matrix(
+MOVE_BACK = _matrix(
     {
         **{(i, i): {None: 1.0} for i in range(3)},
         (0, 2): {_X: -PLACE_M},

@@ -17,7 +17,7 @@ DEGREES = 8
 LONGEST = 256
 """Frames after which the oldest fade instead of staying exact: 51 s at the runtime's rate."""
 PLACE, PLACE_M = 4, 3.0
-_QUARTERS = 0.5 * math.pi * torch.tensor([[0.0, -1.0], [1.0, 0.0]], dtype=torch.float64)
+QUARTERS = 0.5 * math.pi * torch.tensor([[0.0, -1.0], [1.0, 0.0]], dtype=torch.float64)
 """Phases by which the cosine becomes a rotation: cos, sin; -sin, cos."""
 
 
@@ -46,13 +46,13 @@ def add_up(steps: Tensor) -> Tensor:
 
 def _turn(steps: Tensor, yaw: Tensor) -> Tensor:
     """Moves (..., 2) of `steps` (..., 3) as seen from where `yaw` (...) is 0."""
-    rotation = (yaw[..., None, None] + _QUARTERS.to(yaw)).cos()  # (..., 2, 2), of row vectors
+    rotation = (yaw[..., None, None] + QUARTERS.to(yaw)).cos()  # (..., 2, 2), of row vectors
     return (steps[..., None, :2] @ rotation).squeeze(-2)
 
 
 def place(pose: Tensor) -> Tensor:
     """Poses (..., 3) as a network likes them: (..., 4) of unit size, with cosine and sine."""
-    turn = (pose[..., 2:] + _QUARTERS[0].to(pose)).cos()
+    turn = (pose[..., 2:] + QUARTERS[0].to(pose)).cos()
     return torch.cat([pose[..., :2] / PLACE_M, turn], dim=-1)
 
 
@@ -68,7 +68,7 @@ def advance(path: Path, step: Tensor) -> Path:
     moved = _turn(step, path.pose[:, 2])
     pose = path.pose + torch.cat([moved, step[:, 2:]], dim=-1)
     point = path.pose[:, :2] + 0.5 * moved
-    weights = _ADVANCE.to(pose).index_select(0, frame).unflatten(-1, (DEGREES + 1, DEGREES))
+    weights = RECURSION.to(pose).index_select(0, frame).unflatten(-1, (DEGREES + 1, DEGREES))
     series = torch.cat([path.series, point[..., None]], dim=-1) @ weights  # (B, 2, DEGREES)
     return Path(pose, series, path.frames + 1.0)
 
@@ -96,10 +96,7 @@ def _from_start() -> Tensor:
 
 
 def _recursion() -> Tensor:
-    """How the series after frame t follows from the one before and the new point.
-
-    A flat matrix (DEGREES + 1, DEGREES) for each frame.
-    """
+    """How the series after frame t follows from the one before and the new point."""
     nodes, weights = legendre.leggauss(DEGREES)
     norm = 2.0 * np.arange(DEGREES) + 1.0
     advance = np.zeros((LONGEST, DEGREES + 1, DEGREES))
@@ -114,4 +111,5 @@ def _recursion() -> Tensor:
 
 
 _FROM_START = _from_start()
-_ADVANCE = _recursion()
+RECURSION = _recursion()
+"""For each frame a flat matrix (DEGREES + 1, DEGREES)."""

@@ -110,6 +110,13 @@ class Relation(nn.Module):
 
     def forward(self, now: Tensor, target: Tensor) -> Tensor:
         """Attractors (N, 400) twice, to (N, relation)."""
+        return self.layers(self.table(now, target))
+
+    def table(self, now: Tensor, target: Tensor) -> Tensor:
+        """Attractors (N, 400) twice, to the table (N, first, 10 of now, 10 of target).
+
+        It is affine in each; a column of `now` enters its own row alone.
+        """
         now = 2.0 * now.view(-1, *ATTRACTOR_SHAPE) - 1.0
         target = 2.0 * target.view(-1, *ATTRACTOR_SHAPE) - 1.0
         one, other = now.permute(0, 2, 3, 1), target.permute(0, 2, 1, 3)
@@ -119,4 +126,4 @@ class Relation(nn.Module):
         table = self.match(match.permute(0, 2, 3, 1))  # (N, 10 now, 10 target, first)
         table = table + self.now(now.permute(0, 3, 1, 2).flatten(2))[:, :, None]
         table = table + self.target(target.permute(0, 3, 1, 2).flatten(2))[:, None]
-        return self.layers(table.permute(0, 3, 1, 2))
+        return table.permute(0, 3, 1, 2)
