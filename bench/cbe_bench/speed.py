@@ -117,7 +117,10 @@ def _controller(blocks: int) -> dict[str, Any]:
 
 
 class OurTick:
-    """One tick of all networks through the runtime's own interface, image to waypoint."""
+    """One tick of all networks through the runtime's own interface, image to waypoint.
+
+    What stays the same while a behavior lasts is recalled before, as it is in `TheirTick`.
+    """
 
     def __init__(self, networks: Networks) -> None:
         self._networks = networks

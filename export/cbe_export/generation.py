@@ -41,8 +41,9 @@ class RecallTick(nn.Module):
         super().__init__()
         self.generator = networks.generator
         self.inner, _ = _inner(networks)
-        unit = torch.cat([torch.zeros(1, CHANNELS * ROWS), torch.eye(CHANNELS * ROWS)])
-        self.probes = unit[..., None].expand(-1, -1, COLUMNS).flatten(1)  # (1 + 40, 400)
+        # Views whose columns are, in turn, each unit vector (40,) and then zero.
+        units = torch.cat([torch.eye(CHANNELS * ROWS), torch.zeros(COLUMNS, CHANNELS * ROWS)])
+        self.probes = units.unflatten(0, (-1, COLUMNS)).transpose(1, 2).flatten(1)  # (5, 400)
 
     def forward(
         self,
@@ -61,12 +62,13 @@ class RecallTick(nn.Module):
         """The same in parts."""
         generator = self.generator
         relation: Relation = generator.relation
-        # The table is affine in the view from here, so views of one number each tell all of it.
-        tables = relation.table(self.probes, goal)[:, :, 0]
-        bias, *_ = rows = tables.flatten(1)  # (1 + 40, first * 10)
+        # A row of the table is affine in a column of the view from here: unit vectors tell all.
+        table = relation.table(self.probes, goal).transpose(1, 2).flatten(2)  # (5, 10, first * 10)
+        rows = table.flatten(0, 1)
+        bias = rows[CHANNELS * ROWS]
         parts = generator.remember(relation(first, start), embedding_goal)
         return Recalled(
-            (rows[1:] - bias).T,
+            (rows[: CHANNELS * ROWS] - bias).T,
             bias[:, None],
             self.inner(parts.start_relation),
             parts.columns[0],

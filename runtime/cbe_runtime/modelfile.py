@@ -71,7 +71,8 @@ class ModelFile:
                 data = file.read(MAX_FILE_BYTES + 1)
         except FileNotFoundError as error:
             raise ModelError(
-                f"no {path.name} in {path.parent}; give a folder with a model's networks"
+                f"no {path.name} in {path.parent}; give a folder with a model's networks, "
+                "exported with this version"
             ) from error
         except OSError as error:
             raise ModelError(f"cannot read {path}: {error.strerror}; check the file") from error
