@@ -32,6 +32,10 @@ def loop(model):
     model.graph.node[0].op_type = "Loop"
 
 
+def choice(model):
+    model.graph.node[0].op_type = "If"
+
+
 def memory(model):
     model.graph.node[0].op_type = "ConstantOfShape"
 
@@ -61,6 +65,7 @@ def same_key(model):
         (other_file, "another file"),
         (other_file_in_a_constant, "another file"),
         (loop, "operator 'Loop'"),
+        (choice, "operator 'If'"),
         (memory, "operator 'ConstantOfShape'"),
         (subgraph, "graph of its own"),
         (function, "functions"),
